@@ -239,10 +239,6 @@ EXPORTS: dict[str, Export] = {
             "ORIENTATION Z (azimuth °);Time since start in ms ;YYYY-MO-DD HH-MI-SS_SSS", w.a, w.w,
             w.m, w.g, w.lin, w.all(0.0), w.ms, w.all("2015-10-30 10:13:40:921")),
     ),
-    "androsensor_other_units": lambda f, w: write(
-        f, ("a.csv", _ANDROSENSOR.replace("m/s²", "g").replace("rad/s", "°/s")
-            + "Time since start in ms", w.a_g, w.w_deg, w.m, w.ms),
-    ),
     # Unit symbols decoded with another encoding and saved again, or lost.
     "androsensor_garbled": lambda f, w: write(
         f, ("a.csv", _ANDROSENSOR.replace("²", "Â²").replace("μ", "Î¼") + "Time since start in ms",

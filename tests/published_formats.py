@@ -93,7 +93,6 @@ def names(stem: str, axes: str = "xyz") -> str:
 def euroc(folder: Path, walk: ImuSequence, velocity: bool = True) -> Written:
     """EuRoC's layout, or TUM-VI's without velocity: truth at half the rate, not from the start."""
     truth, rows = walk.truth, slice(40, -60, 2)
-    assert truth.velocity_W is not None
     axes = [f"{s}_RS_S_{axis} [{unit}]" for s, unit in (("w", "rad s^-1"), ("a", "m s^-2"))
             for axis in "xyz"]  # fmt: skip
     header = ",".join(["#timestamp [ns]", *axes])
@@ -218,7 +217,6 @@ def rnin(folder: Path, walk: ImuSequence, captured: bool = True) -> Written:
 
 def tlio(folder: Path, walk: ImuSequence, order: str = "xyzw") -> Written:
     truth = walk.truth
-    assert truth.velocity_W is not None
     quat = truth.quat_xyzw if order == "xyzw" else wxyz(truth.attitude_WB)
     R_WB = truth.attitude_WB
     table = np.hstack([

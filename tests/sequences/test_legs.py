@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences import ImuSequence
-from stario.sequences.legs import LegStream, leg_streams
+from stario.sequences import ImuSequence, LegStream, WalkStyle, generate_walk, leg_streams
 from stario.sequences.sequence import FloatArray, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 TIME = np.arange(1.0, 38.0)
 
@@ -29,7 +27,7 @@ def legs_of(
     return legs
 
 
-def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording):
+def test_the_ends_of_a_leg_are_as_certain_as_their_positions_on_another_device(recording):
     """Those of satellites share most of their error, which a displacement does not contain."""
     known = TIME > 4.0
     stated = np.where(known, 3.0 + 0.1 * TIME, 99.0)
@@ -40,9 +38,6 @@ def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording):
     relative = legs.sigma / np.interp(ends, TIME, stated)
     np.testing.assert_allclose(relative, relative[0, 0])
     assert 0.1 < relative[0, 0] < 0.4
-
-
-def test_precise_positions_are_still_those_of_another_device(recording):
     precise = legs_of(recording, TIME, "positions", np.full(len(TIME), 0.01))
     unstated = legs_of(recording, TIME, "positions", None)
     np.testing.assert_allclose(precise.sigma, unstated.sigma)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from cut_windows import windows_of
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stario.network.training.augment import (
@@ -73,13 +72,7 @@ class Drawn:
 
 
 def draw_windows(sampler: WindowSampler, references: FloatArray, count: int) -> list[Drawn]:
-    """Draw windows; determine from each window alone where it begins and how it was rotated.
-
-    Args:
-        sampler: source of the windows.
-        references: (K, 6, 200) windows at every start.
-        count: number of windows.
-    """
+    """Draw windows; find where each begins, among those at every start, and how it was rotated."""
     found = []
     for window, displacement in zip(
         *(t.double().numpy() for t in sampler.batch(count)), strict=True
@@ -145,17 +138,17 @@ def resting(name: str, length: int = 2000, climb: float = 0.0) -> WorldStream:
     imu_W[:, 5] = STANDARD_GRAVITY
     position_W = np.zeros((length, 3), np.float32)
     position_W[:, 2] = climb * np.arange(length) / 200.0
-    return WorldStream(name, imu_W, position_W, facing(length))
+    ahead = np.tile(np.float32([1.0, 0.0]), (length, 1))  # a level device that heads along x
+    return WorldStream(name, imu_W, position_W, ahead)
 
 
-def facing(length: int) -> NDArray[np.float32]:
-    """Facing vectors of a level device that heads along x."""
-    return np.tile(np.float32([1.0, 0.0]), (length, 1))
+def at_rest_with(**ranges: float) -> torch.Tensor:
+    sampler = WindowSampler([resting("rest")], [1.0], replace(YAW_ONLY, **ranges), seed=0)
+    return sampler.batch(256)[0]
 
 
 def test_tilt_rotates_gravity_by_no_more_than_its_limit():
-    ranges = replace(YAW_ONLY, tilt=0.1)
-    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    windows = at_rest_with(tilt=0.1)
     gravity = windows[:, 3:, 0].double()
     np.testing.assert_allclose(gravity.norm(dim=1), STANDARD_GRAVITY, rtol=1e-6)
     angle = torch.acos((gravity[:, 2] / STANDARD_GRAVITY).clamp(max=1.0))
@@ -164,8 +157,7 @@ def test_tilt_rotates_gravity_by_no_more_than_its_limit():
 
 
 def test_biases_are_constant_over_a_window_and_within_their_range():
-    ranges = replace(YAW_ONLY, gyro_bias=0.05, accel_bias=0.2)
-    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    windows = at_rest_with(gyro_bias=0.05, accel_bias=0.2)
     torch.testing.assert_close(windows, windows[:, :, :1].expand(-1, -1, WINDOW_SAMPLES))
     bias = windows[:, :, 0]
     bias[:, 5] -= STANDARD_GRAVITY
@@ -175,8 +167,7 @@ def test_biases_are_constant_over_a_window_and_within_their_range():
 
 
 def test_noise_is_white_and_within_its_deviation():
-    ranges = replace(YAW_ONLY, gyro_noise=0.02, accel_noise=0.15)
-    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    windows = at_rest_with(gyro_noise=0.02, accel_noise=0.15)
     deviation = windows.std(dim=2)
     limits = torch.tensor([0.02] * 3 + [0.15] * 3)
     assert (deviation <= 1.3 * limits).all()
@@ -197,15 +188,12 @@ def test_the_same_seed_draws_the_same_windows():
     assert not torch.equal(first[0], first[2])
 
 
-def test_weights_are_per_second_of_stream():
+def test_weights_are_per_second_of_stream_and_no_window_extends_past_its_end():
     # A short lift up and a long lift down; the short one has three times the weight.
     streams = [resting("up", 1201, climb=1.0), resting("down", 4201, climb=-1.0)]
     _, displacement = WindowSampler(streams, [3.0, 1.0], YAW_ONLY, seed=0).batch(2000)
     share = float((displacement[:, 2] > 0.0).double().mean())
     assert share == pytest.approx(3 * 5 / (3 * 5 + 20), abs=0.05)
-
-
-def test_no_window_extends_past_the_end_of_its_stream():
     streams = [resting(str(k), 400, climb=1.0) for k in range(8)]
     ranges = replace(YAW_ONLY, speeds=(0.6, 1.8), replayed=0.5)
     _, displacement = WindowSampler(streams, [1.0] * 8, ranges, seed=0).batch(2000)
@@ -299,14 +287,7 @@ def test_windows_do_not_depend_on_where_the_device_points():
         torch.testing.assert_close(a, b, atol=5e-3, rtol=1e-3)
 
 
-def test_a_heading_counts_as_much_as_the_device_is_level():
-    """Facing vectors are short where the device points up or down, and its heading is vague."""
-    facing = torch.zeros(1, 1, 10, 2)
-    facing[0, 0, :5, 0], facing[0, 0, 5:, 1] = 0.1, 1.0
-    assert float(heading_of(facing)) == pytest.approx(np.arctan2(1.0, 0.1))
-
-
-def test_a_swing_rotates_the_heading_of_the_device():
+def test_a_swing_rotates_the_heading_which_counts_as_much_as_the_device_is_level():
     """The heading of a level device rotates by the mean vertical component of the swing's angle."""
     generator = torch.Generator().manual_seed(0)
     swings = sample_swing(64, 1.0, 2.0, 0.0, generator)
@@ -317,18 +298,17 @@ def test_a_swing_rotates_the_heading_of_the_device():
     torch.testing.assert_close(
         heading_of(level, swings)[small, 0], turn[small], atol=0.05, rtol=0.0
     )
+    # Facing vectors are short where the device points up or down, and its heading is vague.
+    facing = torch.zeros(1, 1, 10, 2)
+    facing[0, 0, :5, 0], facing[0, 0, 5:, 1] = 0.1, 1.0
+    assert float(heading_of(facing)) == pytest.approx(np.arctan2(1.0, 0.1))
 
 
 # --- rate, acceleration and displacement of a swing are those of one motion -----------------------
 
 
-GRAVITY = 9.80665
-
-
 def at_rest(size: int) -> torch.Tensor:
-    imu = torch.zeros(size, 200, 6, dtype=torch.float64)
-    imu[..., 5] = GRAVITY
-    return imu
+    return torch.from_numpy(resting("rest", 200).imu_W).double().repeat(size, 1, 1)
 
 
 def draw_swing(size: int, share: float = 1.0) -> Swing:
@@ -343,7 +323,7 @@ def test_acceleration_integrates_to_the_displacement():
     now = torch.zeros(1, dtype=torch.float64)
     lever = rotated(swing.lever, swing.axis, swing.angle(now)[0][:, 0])
     velocity = torch.linalg.cross(imu[:, 0, :3], lever)
-    accel = imu[..., 3:] - torch.tensor([0.0, 0.0, GRAVITY])
+    accel = imu[..., 3:] - torch.tensor([0.0, 0.0, STANDARD_GRAVITY])
     dt, moved = 1.0 / 200.0, torch.zeros(64, 3, dtype=torch.float64)
     for k in range(200):
         velocity_next = velocity + 0.5 * dt * (accel[:, k] + accel[:, min(k + 1, 199)])
@@ -353,19 +333,16 @@ def test_acceleration_integrates_to_the_displacement():
     assert (moved - displacement[:, 0]).abs().max() < 2e-3
 
 
-def test_rate_and_acceleration_belong_to_one_rotation():
+def test_rate_and_acceleration_belong_to_one_rotation_and_recorded_rates_turn_with_it():
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
     swing = draw_swing(64)
     imu, _ = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
     alpha = swing.angle(torch.zeros(1, dtype=torch.float64))[0][:, 0]
     lever = rotated(swing.lever, swing.axis, alpha)
-    gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, GRAVITY])
+    gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, STANDARD_GRAVITY])
     velocity = torch.linalg.cross(gyro, lever)
     assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
-
-
-def test_a_swing_turns_the_rates_that_were_recorded():
-    """Rate of the device in the world: its own, turned with it, and that of the swing."""
+    # Rate of the device in the world: its own, turned with it, and that of the swing.
     swing, imu = draw_swing(8), at_rest(8)
     imu[..., :3] = torch.tensor([0.3, -0.2, 0.5])
     alone, _ = apply_swing(at_rest(8), torch.zeros(8, 1, 3, dtype=torch.float64), swing)
@@ -376,24 +353,12 @@ def test_a_swing_turns_the_rates_that_were_recorded():
         assert torch.allclose(both[:, k, :3] - alone[:, k, :3], turned, atol=1e-5)
 
 
-def test_no_swing_is_faster_than_its_bound():
-    swing = draw_swing(512)
-    time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
-    assert 1.5 < swing.angle(time)[1].abs().max() <= 2.5
-
-
-def test_windows_without_a_swing_are_unchanged():
-    imu = torch.randn(16, 200, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    displacement = torch.ones(16, 1, 3, dtype=torch.float64)
-    after, moved = apply_swing(imu, displacement, draw_swing(16, share=0.0))
-    assert torch.allclose(after, imu, atol=1e-10)
-    assert torch.allclose(moved, displacement, atol=1e-10)
-
-
 @pytest.mark.parametrize("share", [0.25, 0.75])
-def test_the_share_of_swung_windows_is_as_requested(share):
+def test_swings_have_the_share_requested_and_none_is_faster_than_its_bound(share):
     swing = draw_swing(4000, share)
     assert (swing.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
+    time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
+    assert 1.5 < swing.angle(time)[1].abs().max() <= 2.5
 
 
 def rotated(vector: torch.Tensor, axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:

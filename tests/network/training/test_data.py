@@ -15,13 +15,10 @@ from stario.network.training.data import (
     split_off,
 )
 from stario.network.training.made import moment_streams, virtual_recordings
-from stario.sequences.datasets.batch import Skipped
+from stario.sequences import STANDARD_GRAVITY, Skipped, WorldStream, generate_walk
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.readers.archive import write_archive
-from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import generate_walk
-from stario.sequences.windows import WorldStream
 
 
 def stream(name: str, samples: int) -> WorldStream:
@@ -36,39 +33,23 @@ def test_the_last_fifth_of_each_recording_is_held_out():
     assert [(s.name, len(s)) for s in first] == [("a", 6000), ("a", 2000), ("b", 4000)]
     assert [(s.name, len(s)) for s in last] == [("a", 2000), ("b", 1000)]
     assert last[0].imu_W[0, 0] == 2000  # where the first part ends
-
-
-def test_parts_too_short_for_windows_are_dropped():
     first, last = split_off(recordings_of([stream("a", 1500)]))
     assert [len(s) for s in first[0].streams] == [1200]
-    assert not last[0].streams
+    assert not last[0].streams  # too short for windows
     assert first[0].has_poses
     assert not last[0].has_poses
 
 
-def test_recorded_and_generated_streams_get_their_shares():
-    recorded = recordings_of([stream("a", 3000), stream("a", 1000)])
-    material = mix_sources(recorded, [stream("c", 700)], {SIMULATED: 0.05})
-    drawn = np.array([len(s) for s in material.streams]) * material.weights
-    assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
-    assert material.words[0].startswith("recorded")
-
-
-def test_bad_moments_get_their_share_of_all_windows():
-    recorded = recordings_of([stream("a", 3000)])
-    shares = {SIMULATED: 0.2, INSERTED: 0.1, "r": 0.3}
-    material = mix_sources(recorded, [stream("c", 700)], shares, moments=[stream("m", 900)])
-    assert drawn_shares(material) == pytest.approx({"a": 0.7, "c": 0.2, "m": 0.1}, abs=1e-3)
-    with pytest.raises(ConfigError, match=r"1\.1 for simulated walks and moments"):
-        mix_sources(recorded, [], {SIMULATED: 0.4, INSERTED: 0.7}, moments=[stream("m", 900)])
-
-
-def test_streams_are_drawn_alike_unless_each_has_a_weight():
+def test_streams_are_drawn_alike_unless_they_have_a_weight_or_more_motion():
     streams = [stream("a", 3000), stream("b", 1000)]
     assert drawn_shares(TrainingData(streams)) == pytest.approx({"a": 0.75, "b": 0.25})
     assert drawn_shares(TrainingData(streams, np.array([1.0, 3.0])))["a"] == pytest.approx(0.5)
     with pytest.raises(InputError, match="weights: found 1, expected 2"):
         TrainingData(streams, [1.0])
+    calm, lively = moving("calm", 0.5), moving("lively", 1.5)
+    material = mix_sources(recordings_of([calm], [lively]), [])
+    assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
+    assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 
 
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
@@ -80,17 +61,30 @@ def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
     return {name: value / sum(found.values()) for name, value in found.items()}
 
 
-def test_named_sources_get_their_shares_whatever_their_length():
+LONG, SHORT = "a/long.h5:x", "a/short.h5:y"
+
+
+@pytest.mark.parametrize(
+    ("paths", "shares", "expected"),
+    [
+        ([LONG, SHORT, "z.csv"], {"long.h5": 0.5, "short.h5": 0.3}, {"x": 0.5, "y": 0.3, "z": 0.2}),
+        ([LONG], {SIMULATED: 0.05}, {"x": 0.95, "simulated": 0.05}),
+        ([LONG], {SIMULATED: 0.2, INSERTED: 0.1}, {"x": 0.7, "simulated": 0.2, "moments": 0.1}),
+        # The share of an absent source goes to the other recordings.
+        ([LONG, "z.csv"], {"long": 0.2, "kipd": 0.5, SIMULATED: 0.1},
+         {"x": 0.36, "z": 0.54, "simulated": 0.1}),
+        ([LONG], {"long": 0.2, "kipd": 0.5, SIMULATED: 0.1}, {"x": 0.9, "simulated": 0.1}),
+    ],
+)  # fmt: skip
+def test_named_sources_get_their_shares_whatever_their_length(paths, shares, expected):
+    names = {LONG: ["x"] * 9, SHORT: ["y"], "z.csv": ["z"]}
     recorded = [
-        RecordingStreams(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
-        RecordingStreams(Path("a/short.h5:y"), [moving("y", 1.0)]),
-        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
+        RecordingStreams(Path(path), [moving(name, 1.0) for name in names[path]]) for path in paths
     ]
-    shares = {"long.h5": 0.5, "short.h5": 0.3}
-    expected = pytest.approx({"x": 0.5, "y": 0.3, "z": 0.2})
-    assert drawn_shares(mix_sources(recorded, [], shares)) == expected
-    with pytest.raises(ConfigError, match="shares"):
-        mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
+    made = [moving("simulated", 1.0).part(0, 700)] if SIMULATED in shares else []
+    moments = [moving("moments", 1.0)] if INSERTED in shares else []
+    found = drawn_shares(mix_sources(recorded, made, shares, moments=moments))
+    assert found == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -114,19 +108,6 @@ def test_a_source_is_named_by_a_folder_an_archive_or_a_file(source, path):
     )
 
 
-def test_the_share_of_an_absent_source_goes_to_the_other_recordings():
-    recorded = [
-        RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
-        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
-    ]
-    shares = {"ridi": 0.2, "kipd": 0.5, SIMULATED: 0.1}
-    found = drawn_shares(mix_sources(recorded, [moving("c", 1.0)], shares))
-    assert found["c"] == pytest.approx(0.1)
-    assert found["x"] == pytest.approx(0.9 * 0.4)
-    alone = drawn_shares(mix_sources(recorded[:1], [moving("c", 1.0)], shares))
-    assert alone["c"] == pytest.approx(0.1)
-
-
 def test_shares_count_the_windows_that_can_be_drawn():
     """Stretches hardly longer than a window hold few windows, which are drawn more often."""
     whole = moving("y", 1.0)
@@ -141,16 +122,21 @@ def test_shares_count_the_windows_that_can_be_drawn():
 
 
 def test_shares_that_leave_nothing_are_refused():
-    recorded = recordings_of([moving("x", 1.0)])
-    for given, generated in (({SIMULATED: 1.0}, []), ({SIMULATED: 0.0}, [moving("c", 1.0)])):
-        with pytest.raises(ConfigError, match="shares: found 0 for every"):
-            mix_sources([] if generated else recorded, generated, given)
+    recorded, made = recordings_of([moving("x", 1.0)]), [moving("c", 1.0)]
+    for given, recordings, generated, words in (
+        ({SIMULATED: 1.0}, recorded, [], "found 0 for every"),
+        ({SIMULATED: 0.0}, [], made, "found 0 for every"),
+        ({"0": 1.0}, recordings_of([moving("x", 1.0)], [moving("z", 1.0)]), [], ""),
+        ({SIMULATED: 0.4, INSERTED: 0.7}, recorded, [], r"1\.1 for simulated walks and moments"),
+    ):
+        with pytest.raises(ConfigError, match=f"shares: .*{words}"):
+            mix_sources(recordings, generated, given, moments=made if INSERTED in given else [])
     with pytest.raises(ConfigError, match=r"shares: found a sum of 1\.2"):
         TrainingConfig(shares={"ridi": 0.6, "kipd": 0.6})
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
 
 
-def test_streams_come_with_the_licence_of_their_archive(tmp_path):
+def test_streams_come_with_the_licence_of_their_archive_and_names_of_their_own(tmp_path):
     walk = simulate_imu(generate_walk(0, 4.0), 100.0, PERFECT_IMU, 0, name="walk")
     licensed = replace(walk, attributes={"licence": "CC BY 4.0"})
     write_archive(tmp_path / "walks.h5", [licensed])
@@ -160,10 +146,7 @@ def test_streams_come_with_the_licence_of_their_archive(tmp_path):
     assert [(one.path, one.licence) for one in found] == [(paths[0], "CC BY 4.0"), (paths[1], "")]
     assert skipped == outcomes[2:]
     assert mix_sources(found, []).words[-1] == "walks.h5, licence CC BY 4.0: 1 recordings, 10 s"
-
-
-def test_recordings_of_one_name_are_told_apart_in_validation():
-    """Their errors would be averaged as those of one recording."""
+    # Their errors would be averaged as those of one recording.
     outcomes = [[moving("walk", speed)] for speed in (1.0, 2.0, 3.0)]
     paths = [Path(f"{k}/walk.csv") for k in range(3)]
     found, _ = recording_streams(zip(paths, outcomes, strict=True))
@@ -172,13 +155,6 @@ def test_recordings_of_one_name_are_told_apart_in_validation():
 
 def recordings_of(*recordings: list[WorldStream]) -> list[RecordingStreams]:
     return [RecordingStreams(Path(str(k)), streams) for k, streams in enumerate(recordings)]
-
-
-def test_recordings_with_more_motion_are_drawn_more_often():
-    calm, lively = moving("calm", 0.5), moving("lively", 1.5)
-    material = mix_sources(recordings_of([calm], [lively]), [])
-    assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
-    assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 
 
 def moving(name: str, acceleration: float) -> WorldStream:
@@ -244,14 +220,10 @@ def test_a_moment_turns_the_device_and_moves_it_by_no_more_than_a_hand_reaches(r
         assert force.mean() == pytest.approx(STANDARD_GRAVITY, rel=0.2)
 
 
-def test_the_last_fifth_of_a_recording_is_left_to_judge(recording, tmp_path):
-    def only_the_end_is_known(path: Path):
-        start = WALK.time[0] + 0.8 * (WALK.time[-1] - WALK.time[0])
-        return replace(WALK, truth=WALK.truth.select(WALK.truth.time > start))
-
-    assert not moment_streams([recording], only_the_end_is_known, {}, 3, tmp_path / "cache")
-
-
-def test_a_recording_without_poses_has_no_moments(recording, tmp_path):
-    read = replace(WALK, truth=None)
-    assert not moment_streams([recording], lambda path: read, {}, 3, tmp_path / "cache")
+def test_the_last_fifth_and_recordings_without_poses_have_no_moments(recording, tmp_path):
+    start = WALK.time[0] + 0.8 * (WALK.time[-1] - WALK.time[0])
+    of_the_end = WALK.truth.select(WALK.truth.time > start)
+    for number, truth in enumerate((of_the_end, None)):
+        cache = tmp_path / str(number)
+        read = replace(WALK, truth=truth)
+        assert not moment_streams([recording], lambda path, read=read: read, {}, 3, cache)

@@ -22,11 +22,8 @@ from stario.network.training.losses import (
     leg_loss,
 )
 from stario.network.training.validation import ValidationSet
-from stario.sequences.attitude.rotations import about_z
-from stario.sequences.legs import LegStream
+from stario.sequences import PERFECT_IMU, LegStream, about_z, generate_walk, simulate_imu
 from stario.sequences.sequence import FloatArray
-from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import WorldStream, world_streams
 
 SECONDS, STRETCHES = 8, 6

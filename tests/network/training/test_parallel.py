@@ -80,12 +80,19 @@ def test_two_processes_train_like_one(network, tolerance, tmp_path):
         torch.testing.assert_close(weights[1][name], value, rtol=1e-4, atol=1e-6)
 
 
-def test_without_a_launcher_the_only_process_is_the_leader():
-    with workers("cpu", 7) as group:
-        assert group.is_leader
-        assert group.total(3.0) == 3.0
-        batch = torch.arange(7)
-        assert torch.equal(group.share([batch])[0], batch)
+def test_without_a_launcher_the_only_process_is_the_leader(monkeypatch):
+    """Also among the processes of a job scheduler, which sets some of its variables."""
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
+    for variables in ({}, {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}):
+        for name, value in variables.items():
+            monkeypatch.setenv(name, value)
+        with workers("cpu", 7) as group:
+            assert (group.rank, group.count) == (0, 1)
+            assert group.is_leader
+            assert is_leader()
+            assert group.total(3.0) == 3.0
+            batch = torch.arange(7)
+            assert torch.equal(group.share([batch])[0], batch)
 
 
 def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch):
@@ -95,12 +102,3 @@ def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch):
     assert not is_leader()
     with pytest.raises(ConfigError, match="7 for 2 processes"), workers("cpu", 7):
         pass
-
-
-def test_variables_of_a_job_scheduler_are_not_those_of_the_launcher(monkeypatch):
-    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
-    for name, value in {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}.items():
-        monkeypatch.setenv(name, value)
-    with workers("cpu", 7) as group:
-        assert (group.rank, group.count) == (0, 1)
-        assert is_leader()

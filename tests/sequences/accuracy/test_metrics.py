@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.accuracy.metrics import (
-    CONVENTIONS,
-    TrackMetrics,
-    align,
-    evaluate_track,
-    pose_errors,
-)
+from stario.sequences import InputError, TrackMetrics, Trajectory, about_z, align, evaluate_track
 from stario.sequences.accuracy.nees import nees, nees_bounds, position_nees
-from stario.sequences.attitude.rotations import about_z
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import Trajectory
 
 ERRORS = ("ate_m", "rte_m", "pde", "aye_rad")
 
@@ -81,24 +72,16 @@ def evo_ape_rmse(estimate: Trajectory, truth: Trajectory, alignment: str) -> flo
     return float(metric.get_all_statistics()["rmse"])
 
 
-def flat(track: Trajectory) -> Trajectory:
-    return replace(track, position_W=track.position_W * [1, 1, 0])
-
-
-@pytest.mark.parametrize("alignment", ["none", "first"])
-def test_ate_agrees_with_evo_in_3d(alignment):
+@pytest.mark.parametrize("alignment", ["none", "first", "yaw"])
+def test_ate_agrees_with_evo(alignment):
     truth = walk()
-    estimate = moved(drifted(truth), 0.4, (1.0, -2.0, 0.3))
+    estimate = moved(drifted(truth), 0.4 if alignment != "yaw" else -2.4, (1.0, -2.0, 0.3))
+    if alignment == "yaw":  # on a plane, Umeyama's rotation is about the vertical
+        truth, estimate = (
+            replace(track, position_W=track.position_W * [1, 1, 0]) for track in (truth, estimate)
+        )
     found = evaluate_track(estimate, truth, alignment=alignment, horizontal=False).ate_m
     assert found == pytest.approx(evo_ape_rmse(estimate, truth, alignment), rel=1e-9)
-
-
-def test_yaw_alignment_agrees_with_evos_umeyama_on_a_plane():
-    # On a plane, Umeyama's rotation is about the vertical, so the two must agree.
-    truth = flat(walk())
-    estimate = flat(moved(drifted(truth), -2.4, (30.0, 5.0, 0.0)))
-    found = evaluate_track(estimate, truth, alignment="yaw").ate_m
-    assert found == pytest.approx(evo_ape_rmse(estimate, truth, "yaw"), rel=1e-9)
 
 
 @pytest.mark.parametrize("mode", ["none", "first", "yaw"])
@@ -115,7 +98,7 @@ def test_alignment_never_changes_the_tilt(mode):
     )
 
 
-def test_first_alignment_matches_the_first_pose_and_rotates_velocity_and_covariance():
+def test_first_alignment_matches_the_first_common_pose_and_rotates_velocity_and_covariance():
     truth = walk()
     covariance = np.broadcast_to(np.diag([4.0, 1.0, 9.0]), (len(truth), 3, 3))
     velocity = np.broadcast_to([1.0, 0.0, 0.5], (len(truth), 3))
@@ -127,9 +110,6 @@ def test_first_alignment_matches_the_first_pose_and_rotates_velocity_and_covaria
     np.testing.assert_allclose(
         aligned.position_covariance_W[0], np.diag([1.0, 4.0, 9.0]), atol=1e-10
     )
-
-
-def test_first_alignment_uses_the_first_pose_valid_in_both_tracks():
     truth = walk()
     late = replace(truth, valid=truth.time >= 10.0)
     estimate = moved(truth, 0.5, (1.0, 2.0, 3.0))
@@ -170,6 +150,12 @@ def test_a_constant_velocity_error_gives_the_analytic_errors(duration, scaled):
     assert found.aye_rad == pytest.approx(0.0, abs=1e-9)
     in_3d = evaluate_track(with_velocity_error(truth, (0.03, 0.04, 0.12)), truth, horizontal=False)
     assert in_3d.rte_m == pytest.approx(0.13 * 60.0)
+    climb = with_velocity_error(straight(duration, speed=0.0), (3.0, 0.0, 4.0))
+    for horizontal, speed in ((True, 3.0), (False, 5.0)):  # the path of what is compared
+        path = evaluate_track(climb, climb, horizontal=horizontal).path_m
+        assert path == pytest.approx(speed * duration)
+    standing = straight(duration, speed=0.0)
+    assert np.isnan(evaluate_track(standing, standing).pde)
 
 
 def test_relative_error_ignores_a_constant_offset():
@@ -212,8 +198,7 @@ def test_truth_is_not_interpolated_across_gaps_and_coverage_excludes_them():
     gap = (truth.time > 40.0) & (truth.time < 60.0)
     wild = np.where((truth.time > 41)[:, None] & (truth.time < 59)[:, None], 1e3, 0.0)
     estimate = replace(truth, position_W=truth.position_W + wild)
-    without_rows = Trajectory(truth.time[~gap], truth.position_W[~gap], truth.attitude_WB[~gap])
-    for gappy in (replace(truth, valid=~gap), without_rows):
+    for gappy in (replace(truth, valid=~gap), truth.select(~gap)):
         found = evaluate_track(estimate, gappy)
         assert found.ate_m == pytest.approx(0.0, abs=1e-9)
         assert found.coverage == pytest.approx(0.8, abs=1e-3)
@@ -237,39 +222,8 @@ def test_relative_error_is_nan_if_a_gap_leaves_no_pair():
 def test_no_overlap_is_an_error_that_names_both_spans():
     truth = straight(10.0)
     later = replace(truth, time=truth.time + 100.0)
-    with pytest.raises(InputError, match=r"overlap: 100\.000 to 110\.000 s against truth 0\.0"):
+    with pytest.raises(InputError, match=r"overlap: 100.* against truth 0"):
         evaluate_track(later, truth)
-    with pytest.raises(InputError, match="no valid pose"):
-        pose_errors(replace(truth, valid=np.zeros(len(truth), dtype=bool)), truth)
-
-
-def test_unknown_choices_are_refused():
-    truth = straight(10.0)
-    with pytest.raises(InputError, match="alignment: found 'sim3'"):
-        align(truth, truth, "sim3")
-    with pytest.raises(InputError, match="convention: found 'median'"):
-        evaluate_track(truth, truth, convention="median")
-    with pytest.raises(InputError, match="rte_interval"):
-        evaluate_track(truth, truth, rte_interval=0.0)
-
-
-def test_drift_per_metre_of_a_stationary_track_is_nan():
-    truth = straight(10.0, speed=0.0)
-    assert np.isnan(evaluate_track(truth, truth).pde)
-
-
-@pytest.mark.parametrize(("horizontal", "path"), [(True, 30.0), (False, 50.0)])
-def test_the_path_is_that_of_the_compared_coordinates(horizontal, path):
-    time = np.arange(101) / 10.0
-    climb = Trajectory(time, np.outer(time, [3.0, 0.0, 4.0]), about_z(0.0 * time))
-    found = evaluate_track(climb, climb, horizontal=horizontal)
-    assert found.path_m == pytest.approx(path)
-
-
-def test_every_metric_has_a_description():
-    described_elsewhere = {"rte_interval_s", "rte_scaled"}  # described under rte_m
-    assert set(TrackMetrics.__dataclass_fields__) - described_elsewhere <= set(CONVENTIONS)
-    assert {"nees", "nis"} <= set(CONVENTIONS)
 
 
 def gaussian_samples(n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -279,14 +233,11 @@ def gaussian_samples(n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray
     return scale * error, factor @ factor.transpose(0, 2, 1)
 
 
-def test_nees_of_gaussian_samples_lies_within_its_bounds():
+def test_nees_of_gaussian_samples_lies_within_bounds_of_the_stated_share():
     low, high = nees_bounds(3, 500, confidence=0.999)
     assert low < nees(*gaussian_samples(500)).mean() < high
     assert nees(*gaussian_samples(500, scale=1.3)).mean() > high
     assert nees(*gaussian_samples(500, scale=0.7)).mean() < low
-
-
-def test_nees_bounds_contain_the_stated_share_of_means():
     rng = np.random.default_rng(5)
     means = (rng.normal(size=(4000, 20, 3)) ** 2).sum(axis=2).mean(axis=1)
     low, high = nees_bounds(3, 20)
@@ -308,13 +259,6 @@ def test_position_nees_skips_a_start_without_covariance_and_is_yaw_invariant():
     other = moved(estimate, 0.9, (1, 2, 3))
     other = replace(other, position_covariance_W=turn @ covariance @ turn.T)
     np.testing.assert_allclose(position_nees(other, truth).nees, found.nees, rtol=1e-6)
-
-
-def test_nees_refuses_invalid_covariances():
-    with pytest.raises(InputError, match="row 1 not positive definite"):
-        nees(np.ones((2, 3)), np.stack([np.eye(3), np.diag([1.0, 1.0, -1.0])]))
-    with pytest.raises(InputError, match="position_covariance_W"):
-        position_nees(walk(), walk())
 
 
 @pytest.mark.parametrize("poses", [1, 600])

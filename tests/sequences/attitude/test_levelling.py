@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences import STANDARD_GRAVITY, ImuSequence, WalkStyle, generate_walk
 from stario.sequences.attitude.levelling import (
     GravityStart,
     LevelledAttitude,
@@ -12,10 +13,8 @@ from stario.sequences.attitude.levelling import (
     start_from_gravity,
 )
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.carrying import CARRYING_MODES
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -27,6 +26,17 @@ def simulated_walk(seed: int, seconds: float, carry: str, errors: ImuErrors) -> 
 
 def start_at(R_WB: np.ndarray, turn_rate: float = 0.5) -> GravityStart:
     return GravityStart(R_WB, False, STANDARD_GRAVITY, turn_rate)
+
+
+def advanced(
+    attitude: LevelledAttitude, steps: int, samples: int = 21, rate: tuple[float, ...] = (0, 0, 0)
+) -> LevelledAttitude:
+    """Advance the attitude of a device that measures gravity along z and a constant rate."""
+    time = np.arange(samples) / 200.0
+    gyro, accel = np.tile(rate, (samples, 1)), np.tile(STANDARD_GRAVITY * UP, (samples, 1))
+    for _ in range(steps):
+        attitude.advance(time, gyro, accel)
+    return attitude
 
 
 def tilt_error(R_NB: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
@@ -102,13 +112,11 @@ def test_levelling_tolerates_uncorrected_gyroscope_rates():
 
 def test_levelling_leaves_yaw_unchanged():
     """The tilt of a device at rest is corrected about a horizontal axis only."""
-    time = np.arange(11) / 200.0
-    accel = np.tile(STANDARD_GRAVITY * UP, (11, 1))
     tilted = exp_so3(np.array([0.08, -0.04, 0.0]))
     attitude = LevelledAttitude(start_at(tilted))
     for _ in range(1200):
         before = attitude.R_NB
-        attitude.advance(time, np.zeros((11, 3)), accel)
+        advanced(attitude, 1, 11)
         turn = Rotation.from_matrix(attitude.R_NB @ before.T).as_rotvec()
         # The estimated bias is horizontal too; what remains is of second order.
         assert abs(turn[2]) < 0.1 * np.linalg.norm(turn[:2]) + 1e-10
@@ -118,11 +126,7 @@ def test_levelling_leaves_yaw_unchanged():
 
 
 def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept():
-    time = np.arange(21) / 200.0
-    accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
-    attitude = LevelledAttitude(start_at(np.eye(3)))
-    for _ in range(300):
-        attitude.advance(time, np.tile([0.02, -0.01, 0.0], (21, 1)), accel)
+    attitude = advanced(LevelledAttitude(start_at(np.eye(3))), 300, rate=(0.02, -0.01, 0.0))
     learned, before = attitude.b_g.copy(), attitude.R_NB
     np.testing.assert_allclose(learned, [0.02, -0.01, 0.0], atol=3e-3)
     turned = exp_so3(np.array([0.9, 0.4, 0.0]))  # with the device, unobserved
@@ -137,31 +141,21 @@ def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept():
 @pytest.mark.parametrize("after_gap", [False, True])
 def test_a_livelier_start_is_levelled_more_quickly(after_gap):
     """A runner's first second gives a tilt that is off by ten degrees."""
-    time = np.arange(21) / 200.0
-    accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
     off = exp_so3(np.array([0.2, 0.0, 0.0]))
     errors = []
     for turn_rate in (0.5, 1.0, 3.0):
         start = start_at(off, turn_rate)
         attitude = LevelledAttitude(start)
         if after_gap:
-            attitude = LevelledAttitude(start_at(np.eye(3)))
-            for _ in range(100):
-                attitude.advance(time, np.zeros((21, 3)), accel)
+            attitude = advanced(LevelledAttitude(start_at(np.eye(3))), 100)
             attitude.level(np.eye(3), start)
-        for _ in range(20):
-            attitude.advance(time, np.zeros((21, 3)), accel)
-        errors.append(tilt_error(attitude.R_NB, np.eye(3)))
+        errors.append(tilt_error(advanced(attitude, 20).R_NB, np.eye(3)))
     assert errors[0] == errors[1]
     assert errors[2] < 0.6 * errors[1] < 0.5 * tilt_error(off, np.eye(3))
 
 
 def test_levelling_leaves_a_rotating_level_device_unchanged():
-    time = np.arange(11) / 200.0
-    gyro, accel = np.tile([0.0, 0.0, 2.0], (11, 1)), np.tile(STANDARD_GRAVITY * UP, (11, 1))
-    attitude = LevelledAttitude(start_at(np.eye(3)))
-    for _ in range(100):
-        attitude.advance(time, gyro, accel)
+    attitude = advanced(LevelledAttitude(start_at(np.eye(3))), 100, 11, (0.0, 0.0, 2.0))
     expected = exp_so3(np.array([0.0, 0.0, 2.0 * 100 * 0.05]))
     np.testing.assert_allclose(attitude.R_NB, expected, atol=1e-9)
 

@@ -21,17 +21,14 @@ def test_skew_is_the_cross_product():
     np.testing.assert_allclose(so3.cross(a, b), np.cross(a, b), atol=1e-10)
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-def test_exp_agrees_with_scipy(angle):
-    theta = rotation_vectors(angle)
+def test_exp_agrees_with_scipy_and_log_inverts_it():
+    """One by one and in a stack of mixed angles."""
+    theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
     expected = Rotation.from_rotvec(theta).as_matrix()
-    np.testing.assert_allclose(so3.exp_so3(theta), expected, rtol=0.0, atol=1e-10)
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_log_inverts_exp(angle):
-    theta = rotation_vectors(angle)
-    np.testing.assert_allclose(so3.log_so3(so3.exp_so3(theta)), theta, rtol=1e-6, atol=1e-12)
+    singly = np.stack([so3.exp_so3(row) for row in theta])
+    for found in (so3.exp_so3(theta), singly):
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(so3.log_so3(found), theta, rtol=1e-6, atol=1e-12)
 
 
 def test_log_of_half_turns():
@@ -50,12 +47,6 @@ def test_the_left_jacobian_agrees_with_finite_differences(angle):
             plus, minus = so3.exp_so3(theta + d), so3.exp_so3(theta - d)
             left[:, k] = (so3.log_so3(plus @ R.T) - so3.log_so3(minus @ R.T)) / (2 * step)
         np.testing.assert_allclose(so3.exp_and_left_jacobian(theta)[1], left, atol=1e-6)
-
-
-def test_exp_of_a_stack_of_mixed_angles_equals_one_at_a_time():
-    theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
-    singly = np.stack([so3.exp_so3(row) for row in theta])
-    np.testing.assert_allclose(so3.exp_so3(theta), singly, atol=1e-10)
 
 
 def same(found: Rotation, expected: Rotation) -> None:

@@ -9,10 +9,9 @@ import pytest
 from joblib import parallel_config
 
 from stario.network.training.splits import NAMES, read_packaged_list
+from stario.sequences import InputError, ReadError, find_recordings
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import hold_out_group, random_split, read_list
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import find_recordings
 
 
 @pytest.mark.parametrize("jobs", [None, 1, 2])
@@ -32,7 +31,7 @@ def test_a_failing_item_is_skipped_with_its_reason(jobs):
     assert skipped == [odd]
 
 
-def test_results_are_yielded_one_by_one():
+def test_results_are_yielded_one_by_one_and_an_exception_costs_one(caplog):
     processed = []
 
     def record(number):
@@ -43,6 +42,10 @@ def test_results_are_yielded_one_by_one():
     assert next(results) == 0
     assert len(processed) < 10
     assert list(results) == list(range(1, 10))
+    outcomes = list(each(lambda number: 1 // number, [1, 0, -1]))
+    assert outcomes[::2] == [1, -1]
+    assert outcomes[1].reason.startswith("ZeroDivisionError")
+    assert "Traceback" in caplog.text
 
 
 def double(number: int) -> int:
@@ -55,20 +58,12 @@ def test_a_backend_that_returns_nothing_before_the_end_works_too():
         assert list(each(double, [1, 2, 3], 2)) == [2, 4, 6]
 
 
-def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(caplog):
-    outcomes = list(each(lambda number: 1 // number, [1, 0, -1]))
-    assert outcomes[::2] == [1, -1]
-    assert outcomes[1].reason.startswith("ZeroDivisionError")
-    assert "Traceback" in caplog.text
-
-
 def test_several_jobs_run_in_separate_processes():
     def process(delay):
         time.sleep(delay)
         return os.getpid()
 
-    found = set(each(process, [0.2] * 4, 2))
-    assert os.getpid() not in found
+    assert os.getpid() not in set(each(process, [0.2] * 4, 2))
     assert set(each(process, [0.0], 1)) == {os.getpid()}
 
 
@@ -84,8 +79,6 @@ def test_the_papers_split_is_by_recording_and_reproducible_by_seed():
     assert random_split(paths, seed=8) != split
     few = random_split(paths[:3], seed=0)
     assert [len(few.training), len(few.validation), len(few.test)] == [1, 1, 1]
-    with pytest.raises(InputError, match="at least 3"):
-        random_split(paths[:2], seed=0)
 
 
 def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path):
@@ -126,7 +119,7 @@ def test_a_text_of_something_else_is_one_error(tmp_path):
     path = tmp_path / "serial.txt"
     path.write_text("".join(f"t: {k} ax: 0.1 ay: 0.2 az: 9.8\n" for k in range(100)))
     errors = []
-    with pytest.raises(ReadError, match="found 100 lines without an existing name, such as t: 0 "):
+    with pytest.raises(ReadError, match=r"100 lines .* such as t: 0 "):
         find_recordings(path, errors.append)
     assert errors == []
 

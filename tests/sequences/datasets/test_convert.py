@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from stario.sequences import Barometer, DeviceAttitude, Magnetometer, Satellites, find_recordings
 from stario.sequences.datasets.convert import convert
 from stario.sequences.errors import InputError
-from stario.sequences.files import atomic_folder
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.archive import write_archive
-from stario.sequences.sequence import STANDARD_GRAVITY, PositionTrack, Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY, PositionTrack
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
@@ -25,7 +24,6 @@ def walk():
     rng = np.random.default_rng(4)
     sequence = simulate_imu(generate_walk(5, 12.0), 200.0, seed=3, name="walk").slice(2.0, 10.0)
     truth = sequence.truth
-    assert truth is not None
     jitter_ns = np.sort(rng.choice(8 * 10**9, len(sequence), replace=False))
     truth_ns = np.sort(rng.choice(9 * 10**9, len(truth), replace=False)) - 10**9
     return replace(
@@ -101,49 +99,28 @@ def test_positions_that_a_csv_would_change_give_a_warning(
     assert f", {kind} alongside true poses, its attributes: write .h5" in caplog.text
 
 
-def test_a_recording_without_truth_is_converted_without_truth(walk, tmp_path):
+def test_short_recordings_without_truth_are_converted(walk, tmp_path):
+    """Too short to check their units."""
     for path in (tmp_path / "a.csv", tmp_path / "a"):
-        convert(walk.without_truth(), path)
+        convert(walk.without_truth().slice(0.0, 0.5), path)
         assert read_recording(path).truth is None
-
-
-def test_wrong_units_are_refused_and_nothing_is_written(walk, tmp_path):
-    with pytest.raises(InputError, match=r"give 9\.80665 \* accel"):
-        convert(replace(walk, accel=walk.accel / STANDARD_GRAVITY), tmp_path / "a.csv")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_recording_too_short_to_check_is_converted(walk, tmp_path):
-    convert(walk.without_truth().slice(0.0, 0.5), tmp_path / "short")
-    assert read_recording(tmp_path / "short").duration < 0.5
+        assert read_recording(path).duration < 0.5
 
 
 def test_what_cannot_be_converted_is_refused_with_the_reason(walk, tmp_path):
-    time = walk.time.copy()
-    time[3] = np.nan
-    with pytest.raises(InputError, match=r"time of sample 3: found nan.*convert to csv"):
-        convert(replace(walk.without_truth(), time=time), tmp_path / "r")
-    with pytest.raises(InputError, match="layout: found 'bag', expected one of csv, euroc"):
-        convert(walk, tmp_path / "r", "bag")
-    with pytest.raises(InputError, match="existing folder"):
-        convert(walk, tmp_path / "no" / "r")
-    assert not list(tmp_path.iterdir())
+    time = np.where(np.arange(len(walk)) == 3, np.nan, walk.time)
+    in_g = replace(walk, accel=walk.accel / STANDARD_GRAVITY)
     (tmp_path / "full").mkdir()
     (tmp_path / "full/file").touch()
-    with pytest.raises(InputError, match="file, which would be lost"):
-        convert(walk, tmp_path / "full")
-    assert [p.name for p in (tmp_path / "full").iterdir()] == ["file"]
-
-
-def test_a_folder_appears_whole_or_not_at_all(tmp_path):
-    def fail(folder):
-        (folder / "half").touch()
-        assert not (tmp_path / "whole").exists()
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError), atomic_folder(tmp_path / "whole") as folder:
-        fail(folder)
-    assert not list(tmp_path.iterdir())
+    for recording, name, words in (
+        (replace(walk.without_truth(), time=time), "r", r"time of sample 3: .*convert to csv"),
+        (walk, "no/r", "existing folder"),
+        (walk, "full", "file, which would be lost"),
+        (in_g, "a.csv", r"give 9\.80665 \* accel"),
+    ):
+        with pytest.raises(InputError, match=words):
+            convert(recording, tmp_path / name)
+    assert [p.name for p in tmp_path.rglob("*")] == ["full", "file"]
 
 
 def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):
@@ -153,7 +130,6 @@ def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):
     early = replace(sequence, truth=replace(truth, time=truth.time - 2.5))
     convert(early, tmp_path / "w")
     found = read_recording(tmp_path / "w").truth
-    assert isinstance(found, Trajectory)
     np.testing.assert_allclose(found.time, truth.time - 2.5, atol=1e-9)
 
 
@@ -162,34 +138,26 @@ def hall():
     """A recording with everything: lost samples, ground truth with gaps, velocity, magnetometer."""
     rng = np.random.default_rng(1)
     sequence = simulate_imu(generate_walk(5, 6.0), 100.0, seed=3, name="hall/walk")
-    truth = sequence.truth
-    assert truth is not None
-    gyro = sequence.gyro.copy()
+    truth, gyro, time = sequence.truth, sequence.gyro.copy(), sequence.time[::3]
     gyro[17, 1] = np.nan
-    time = sequence.time[::3]
-    waypoints = np.array([[1.0, 2.0], [3.0, 4.0]])
+    covariance = np.tile(np.eye(3), (len(truth), 1, 1))
     latlon_deg = np.array([[48.1, 11.5], [48.1, 11.6]])
     return replace(
         sequence,
         gyro=gyro,
         truth=replace(
-            truth,
-            valid=rng.random(len(truth)) > 0.1,
-            position_covariance_W=np.tile(np.eye(3), (len(truth), 1, 1)),
+            truth, valid=rng.random(len(truth)) > 0.1, position_covariance_W=covariance
         ),
         magnetometer=Magnetometer(time + 1e-3, rng.normal(0.0, 40.0, (len(time), 3))),
         positions=PositionTrack(
-            np.array([0.5, 3.0]),
-            waypoints,
-            "waypoints",
-            latlon_deg=latlon_deg,
-            floor=np.array([0.0, np.nan]),
+            [0.5, 3.0], [[1.0, 2.0], [3.0, 4.0]], "waypoints",
+            latlon_deg=latlon_deg, floor=np.array([0.0, np.nan]),
         ),
         barometer=Barometer(time, rng.normal(980.0, 0.1, len(time))),
         satellites=Satellites(np.array([1.0, 2.0]), latlon_deg, radius_m=np.array([4.0, np.nan])),
         attributes={"person": "ann", "minutes": 0.1},
         device_attitude=DeviceAttitude(time, Rotation.random(len(time), random_state=2)),
-    )
+    )  # fmt: skip
 
 
 def test_recordings_are_read_back_as_written(hall, tmp_path):
@@ -218,9 +186,5 @@ def test_an_archive_is_written_whole_or_not_at_all(hall, tmp_path):
 
     with pytest.raises(InputError, match="broken"):
         write_archive(path, failing())
-    with pytest.raises(InputError, match="no recording"):
-        write_archive(path, [])
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(InputError, match=r"walks\.csv"):
-        write_archive(tmp_path / "walks.csv", [hall])

@@ -2,8 +2,7 @@
 
 import pytest
 
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences import WalkStyle, generate_walk, simulate_imu
 
 
 @pytest.fixture(scope="module")

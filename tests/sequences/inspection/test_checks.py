@@ -7,15 +7,13 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
 
+from stario.sequences import PHONE_IMU, InputError, inspect_recording, simulate_imu, with_units
 from stario.sequences.conventions import SAME_AXES, with_axes, with_conventions
-from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units, unit_findings
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.carrying import CARRYING_MODES
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.units import with_units
 
 
 def in_degrees(sequence: ImuSequence) -> ImuSequence:
@@ -40,17 +38,14 @@ def test_walks_pass_and_their_wrong_units_are_named(carry):
     assert "record the raw accelerometer" in refusal(without_gravity(walk).without_truth())
 
 
-def test_a_hard_shaken_device_passes_but_not_without_gravity():
+def test_a_hard_shaken_device_and_a_swinging_pocket_pass_but_not_without_gravity():
     """The median norm of its samples exceeds 12.5 m/s^2, yet their average is gravity."""
     style = WalkStyle(carry="swinging", preferred_speed=2.0)
     shaken = simulate_imu(generate_walk(1, 10.0, style=style), 200.0, PHONE_IMU, 1)
     assert np.median(np.linalg.norm(shaken.accel, axis=1)) > 12.5
     check_units(shaken)
     assert "--gravity removed" in refusal(without_gravity(shaken))
-
-
-def test_the_unit_is_not_asked_of_a_phone_that_swings_in_a_pocket():
-    """Its average force is as large in either unit, but not since it turned about the vertical."""
+    # Its average force is as large in either unit, but not since it turned about the vertical.
     style = WalkStyle(carry="pocket", preferred_speed=1.4)
     swung = simulate_imu(generate_walk(0, 30.0, style=style), 100.0, PHONE_IMU).without_truth()
     assert np.percentile(np.linalg.norm(swung.gyro, axis=1), 95) > 3.0
@@ -69,15 +64,12 @@ def test_a_device_at_rest_passes_but_not_with_its_bias_in_degrees():
     assert "record the raw accelerometer" in refusal(replace(still, accel=still.accel - UP))
 
 
-def test_a_reversed_sign_is_detected_only_with_a_true_attitude(walk):
+def test_a_reversed_sign_and_other_axes_are_named_only_with_a_true_attitude(walk):
     apple = replace(walk, accel=-walk.accel)
     assert "--accel-sign apple" in refusal(apple)
     check_units(with_conventions(apple, accel_sign="apple"))
     check_units(apple.without_truth())
-
-
-def test_axes_that_differ_from_the_truths_are_named(walk):
-    """Also if gravity points exactly down, which a wrong sign would explain too."""
+    # Also if gravity points exactly down, which a wrong sign would explain too.
     for axes, undone in (("y,z,x", "z,x,y"), ("x,-y,-z", "x,-y,-z"), ("z,y,-x", "-z,y,x")):
         turned = replace(with_axes(walk, axes), axes=SAME_AXES)
         assert f"--axes={undone}" in refusal(turned)
@@ -269,6 +261,8 @@ def test_the_unit_of_a_vehicle_that_turns_about_the_vertical_is_asked_for(caplog
     caplog.clear()
     check_units(robot)
     assert ("np.radians(gyro)" in caplog.text) == asked
+    codes = [found.code for found in inspect_recording(robot).findings]
+    assert ("gyro_unit_open" in codes) == asked
 
 
 def test_advice_on_arrays_names_no_option_of_the_command(walk):

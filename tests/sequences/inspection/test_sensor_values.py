@@ -8,25 +8,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
 
-from stario.sequences.inspection.checks import check_units
+from stario.sequences import PHONE_IMU, WalkStyle, check_units, generate_walk, simulate_imu
 from stario.sequences.inspection.samples import dead_axes, sample_findings, stuck_findings
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 
-def test_a_constant_gyroscope_is_refused_while_the_accelerometer_varies(walk):
-    for value in (0.0, 0.3):
-        dead = replace(walk, gyro=np.full_like(walk.gyro, value))
-        assert "gyroscope: found values that never change" in refusal(dead)
-        assert len(told(dead.without_truth())) == 1
-
-
-@pytest.mark.parametrize("value", [0.0, 5.66])
-def test_a_constant_accelerometer_is_refused_while_the_device_tilts(walk, value):
-    dead = replace(walk, accel=np.full_like(walk.accel, value)).without_truth()
-    assert "accelerometer: found values that never change" in refusal(dead)
-    assert len(told(dead)) == 1
+@pytest.mark.parametrize(
+    ("sensor", "value", "name"),
+    [("gyro", 0.0, "gyroscope"), ("gyro", 0.3, "gyroscope"),
+     ("accel", 0.0, "accelerometer"), ("accel", 5.66, "accelerometer")],
+)  # fmt: skip
+def test_a_constant_sensor_is_refused_while_the_other_varies(walk, sensor, value, name):
+    dead = replace(walk, **{sensor: np.full((len(walk), 3), value)})
+    for recording in (dead, dead.without_truth()):
+        assert f"{name}: found values that never change" in refusal(recording)
+    assert len(told(dead.without_truth())) == 1
 
 
 def test_a_constant_rate_without_noise_and_a_device_at_rest_pass():
@@ -84,11 +80,8 @@ def test_one_huge_value_neither_refuses_nor_warns(walk):
         check_units(sequence)
         (text,) = told(sequence)
     assert text.endswith("in 1 sample")
-
-
-def test_one_spike_does_not_turn_the_average_force(walk):
     accel = walk.accel.copy()
-    accel[100] = [9e4, 0.0, 0.0]
+    accel[100] = [9e4, 0.0, 0.0]  # nor does one spike turn the average force
     check_units(replace(walk, accel=accel))
 
 
@@ -139,14 +132,11 @@ def test_motion_in_a_plane_is_no_problem():
         assert dead_axes(planar) == []
 
 
-def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(mounted):
+def test_two_equal_samples_are_not_stuck_and_few_or_rounded_maxima_are_no_limit(mounted):
     gyro, accel = mounted.gyro.copy(), mounted.accel.copy()
     gyro[501] = gyro[500]
     accel[501, 0] += 9.0
     assert stuck_findings(1e3 * mounted.time, gyro, accel) == []
-
-
-def test_few_or_coarsely_rounded_maxima_are_no_limit(mounted):
     short = mounted.slice(0.0, 4.0)
     accel = short.accel.copy()
     accel[100:103, 0] = 40.0  # twice a repetition: a knock

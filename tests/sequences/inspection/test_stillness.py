@@ -2,11 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences import ImuNoise, WalkStyle, generate_walk, simulate_imu
 from stario.sequences.inspection.stillness import find_rest, scatter_bound
-from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 NOISE = ImuNoise(gyro_noise=8e-4, accel_noise=6e-3)
 BIAS = np.array([0.01, -0.02, 0.005])
@@ -34,7 +32,9 @@ def test_noise_and_bias_match_the_sensor_at_any_rate(rate):
     assert rest.accel_noise_m_s2_sqrt_hz == pytest.approx(NOISE.accel_noise, rel=0.1)
 
 
-def test_a_walk_contains_no_rest():
+def test_a_walk_contains_no_rest_and_less_than_a_second_is_too_short():
+    assert find_rest(device_at_rest(0.8, 100.0)) is None
+    assert find_rest(device_at_rest(0.2, 100.0)) is None
     assert find_rest(simulate_imu(generate_walk(2, 20.0, style=WalkStyle()), 200.0)) is None
 
 
@@ -54,25 +54,17 @@ def test_rest_is_found_between_motions_but_not_across_a_gap():
     assert f == pytest.approx(12.0, abs=0.5)
 
 
-def test_a_slow_turn_is_not_mistaken_for_bias():
+def test_a_slow_turn_is_no_bias_and_a_large_bias_without_a_turn_is_one():
     still = device_at_rest(10.0, 100.0)
     about_up = ImuSequence("t", still.time, still.gyro + 0.1 * UP_B, still.accel)
     assert find_rest(about_up) is None
     rate = np.array([0.0, 0.1, 0.0])
     gravity = Rotation.from_rotvec(-np.outer(still.time, rate)).apply(still.accel)
     assert find_rest(ImuSequence("t", still.time, still.gyro + rate, gravity)) is None
-
-
-def test_a_large_bias_is_one_if_gravity_does_not_turn():
     still, bias = device_at_rest(10.0, 100.0), np.array([-0.12, 0.0, 0.02])
     rest = find_rest(ImuSequence("t", still.time, still.gyro - BIAS + bias, still.accel))
     assert rest.seconds == pytest.approx(10.0, abs=0.6)
     np.testing.assert_allclose(rest.gyro_bias_rad_s, bias, atol=1e-3)
-
-
-def test_less_than_a_second_of_rest_is_too_short():
-    assert find_rest(device_at_rest(0.8, 100.0)) is None
-    assert find_rest(device_at_rest(0.2, 100.0)) is None
 
 
 def test_one_in_a_thousand_stretches_at_rest_fails_the_test_whatever_their_length():

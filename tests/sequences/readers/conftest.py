@@ -1,8 +1,7 @@
 import pytest
 from published_formats import WRITERS, walk_of
 
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences import WalkStyle, generate_walk, simulate_imu
 
 
 @pytest.fixture(scope="module")

@@ -35,9 +35,8 @@ def _archive(path: Path) -> Path:
 def test_each_recording_has_its_kind_of_truth(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     pose, track, waypoints = (read_recording(found) for found in find_recordings(path))
-    assert pose.truth is not None
+    assert len(pose.truth) == 50
     assert pose.positions is None
-    assert pose.magnetometer is not None
     assert len(pose.magnetometer) == 10
     assert track.truth is None
     assert track.positions.kind == "positions"
@@ -61,12 +60,11 @@ def test_patterns_lists_and_folders_select_the_same_recordings(tmp_path):
 
 def test_what_is_not_in_an_archive_is_refused_with_what_is(tmp_path):
     path = _archive(tmp_path / "walks.h5")
-    with pytest.raises(ReadError, match=r"person=eve: found none, .* person to be one of ann, bob"):
+    with pytest.raises(ReadError, match=r"person=eve: .* one of ann, bob"):
         find_recordings(path, where={"person": ["eve"]})
-    with pytest.raises(ReadError, match="'d', expected a name in it, such as a, b, c"):
-        read_recording(f"{path}:d")
-    with pytest.raises(ReadError, match=r"3 recordings, expected the name of one; use walks\.h5:a"):
-        read_recording(path)
+    for name, words in ((":d", "'d', .* a, b, c"), ("", r"3 recordings, .*use walks\.h5:a")):
+        with pytest.raises(ReadError, match=words):
+            read_recording(f"{path}{name}")
     with path.open() as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(ReadError, match="close it in the program that writes it"):
@@ -77,7 +75,7 @@ def test_what_is_not_in_an_archive_is_refused_with_what_is(tmp_path):
     with pytest.raises(ReadError, match="imu/t: found none in the whole archive"):
         find_recordings(path)
     path.write_bytes(path.read_bytes()[:3000])
-    with pytest.raises(ReadError, match=r"walks\.h5: content: found .*truncated.*complete"):
+    with pytest.raises(ReadError, match=r"walks\.h5: content: .*truncated.*complete"):
         read_recording(path)
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from csv_lines import write_lines
 
-from stario.sequences import ReadError, check_units, read_recording
-from stario.sequences.errors import InputError
+from stario.sequences import InputError, ReadError, check_units, read_recording
 from stario.sequences.readers.text import with_seconds
 
 NOON = datetime(2024, 5, 1, 12, 34, 56, 789000)
@@ -63,16 +62,16 @@ def test_days_of_a_spreadsheet_are_times(tmp_path, header):
     assert "taken as" not in read.source
 
 
-def test_zones_and_names_of_months_give_the_same_instant():
+def test_zones_give_the_same_instant_and_midnight_passes_in_every_column_and_for_late_rows():
     noon = "1714564800.5"
     for text in ("2024-05-01T12:00:00.5Z", "2024-05-01 14:00:00.5 +02:00", "2024/05/01 12:00:00.5",
                  "2024-05-01 08:30:00.5 GMT-0330", "01-May-2024 12:00:00.5",
                  "2024-05-01_14:00:00.5+02"):  # fmt: skip
         assert with_seconds([text]) == [noon]
-
-
-def test_a_cell_after_a_blank_is_no_zone():
-    assert with_seconds(["12:00:00.5 -12 3"])[0].endswith(".5 -12 3")
+    lines = ["23:59:59.9,23:59:58.9", "00:00:00.1,23:59:59.1", "23:59:59.95,00:00:00.1"]
+    first, second = np.array([[float(x) for x in row.split(",")] for row in with_seconds(lines)]).T
+    np.testing.assert_allclose(first - first[0], [0.0, 0.2, 0.05], atol=1e-9)
+    np.testing.assert_allclose(second - second[0], [0.0, 0.2, 1.2], atol=1e-9)
 
 
 @pytest.mark.parametrize("header", [GENERIC, WIDE])
@@ -91,38 +90,33 @@ def test_dates_without_separators_are_refused(tmp_path, header, digits):
         read_recording(path)
 
 
-def test_midnight_passes_in_every_column_of_times_and_for_late_rows():
-    lines = ["23:59:59.9,23:59:58.9", "00:00:00.1,23:59:59.1", "23:59:59.95,00:00:00.1"]
-    first, second = np.array([[float(x) for x in row.split(",")] for row in with_seconds(lines)]).T
-    np.testing.assert_allclose(first - first[0], [0.0, 0.2, 0.05], atol=1e-9)
-    np.testing.assert_allclose(second - second[0], [0.0, 0.2, 1.2], atol=1e-9)
+@pytest.mark.parametrize(
+    ("lines", "seconds"),
+    [
+        ("12:00:00:5 12:00:00:15 12:00:00:105 12:00:01:0 12:00:02", [0.0, 0.01, 0.1, 0.995, 1.995]),
+        ("12:00:00:05 12:00:00:95", [0.0, 0.9]),
+    ],
+)
+def test_milliseconds_after_a_colon_may_lack_zeros(lines, seconds):
+    time = np.array(with_seconds(lines.split()), dtype=np.float64)
+    np.testing.assert_allclose(time - time[0], seconds, atol=1e-9)
 
 
-def test_milliseconds_after_a_colon_may_lack_zeros():
-    lines = ["12:00:00:5", "12:00:00:15", "12:00:00:105", "12:00:01:0", "12:00:02"]
-    time = np.array(with_seconds(lines), dtype=np.float64)
-    np.testing.assert_allclose(time - time[0], [0.0, 0.01, 0.1, 0.995, 1.995], atol=1e-9)
-    hundredths = np.array(with_seconds(["12:00:00:05", "12:00:00:95"]), dtype=np.float64)
-    assert hundredths[1] - hundredths[0] == pytest.approx(0.9)
-
-
-@pytest.mark.parametrize("text", ["24:60:00", "2024-13-01 12:00:00", "01-Foo-2024 12:00:00"])
-def test_what_is_no_time_stays_as_it_is(text):
-    assert with_seconds([text]) == [text]
-    assert with_seconds([f"D4:22:CD:{text[-8:]}"]) == [f"D4:22:CD:{text[-8:]}"]
-
-
-def test_a_comma_after_the_seconds_separates_cells():
+def test_what_is_no_part_of_a_time_stays_as_it_is():
+    for text in ("24:60:00", "2024-13-01 12:00:00", "01-Foo-2024 12:00:00"):
+        assert with_seconds([text]) == [text]
+        assert with_seconds([f"D4:22:CD:{text[-8:]}"]) == [f"D4:22:CD:{text[-8:]}"]
+    assert with_seconds(["12:00:00.5 -12 3"])[0].endswith(".5 -12 3")
     assert with_seconds(["00:00:01,5,6"])[0].endswith(",5,6")
 
 
 def test_a_comma_before_fractions_that_separates_cells_is_refused(tmp_path):
     """As Python's logging writes times: all values would be read from the column to their left."""
     rows = [f"2024-05-01 12:00:0{k // 100},{10 * k % 1000:03d},0,0,0,0,0,9" for k in range(200)]
-    path = write_lines(tmp_path / "own.csv", GENERIC.replace(";", ","), *rows)
+    path = write_lines(tmp_path / "own.csv", GENERIC, *rows)
     with pytest.raises(ReadError, match=r"line 2: found 8 values, expected 7 .* decimal points"):
         read_recording(path)
-    write_lines(path, GENERIC.replace(";", ","), *(row.replace(",", ".", 1) for row in rows))
+    write_lines(path, GENERIC, *(row.replace(",", ".", 1) for row in rows))
     assert read_recording(path).rate == pytest.approx(100.0)
 
 

@@ -5,9 +5,8 @@ from pathlib import Path
 import pytest
 from recorded import DATA
 
+from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.readers import find_recordings, is_list, read_recording, write_csv
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import generate_walk
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 

@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 from csv_lines import ROW, write_lines
 
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import write_csv
+from stario.sequences import ImuSequence, InputError, ReadError, with_units, write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.units import with_units
 
 
 def test_bad_samples_and_their_order_are_kept(tmp_path, walk):
@@ -58,7 +55,7 @@ def test_a_count_of_rows_is_no_time_unless_it_has_a_unit(tmp_path, first, caplog
     assert "own.csv: its times name no unit, their rate fits ms" in caplog.text
 
 
-def test_slower_truth_has_only_its_own_rows(tmp_path):
+def test_slower_truth_has_only_its_own_rows_and_an_outlying_time_loses_no_other(tmp_path):
     rows = [
         f"{0.01 * k},{ROW}," + (f"{k},0,1,0,0,0,1" if k % 5 == 0 else ",,,,,,") for k in range(21)
     ]
@@ -70,6 +67,11 @@ def test_slower_truth_has_only_its_own_rows(tmp_path):
     assert np.allclose(read.truth.position_W[:, 0], [0, 5, 10, 15])
     none = [row.rsplit(",", 7)[0] + ",,,,,,," for row in rows]
     assert read_generic_csv(write_lines(path, f"{HEADER},{TRUTH_HEADER}", *none)).truth is None
+    rows = [f"{0.01 * k + 1e6 * (k == 3)},{ROW},{k},0,1,0,0,0,1" for k in range(10)]
+    truth = read_generic_csv(
+        write_lines(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
+    ).truth
+    assert truth.position_W[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
 GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
@@ -88,10 +90,7 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
         ([HEADER + ",mx [uT]", *GOOD[1:]], "no my, mz"),
         ([HEADER + ",px [mm],py,pz,qx,qy,qz,qw", *GOOD[1:]], "px: found unit 'mm', expected m"),
         ([HEADER.replace(",", ";"), *GOOD[1:]], "line 2: found 1 values, expected 7; separate"),
-        (
-            [HEADER.replace(",", ";"), f"0;{ROW.replace(',', ';')}", "1;0,1;0;0;1;2;9"],
-            "line 3, gx: found '0,1', expected a number; write a decimal point",
-        ),
+        ([HEADER.replace(",", ";"), "0.1;0;0;0;1;2;9", "1;0,1;0;0;1;2;9"], "line 3, gx: ... point"),
         ([*GOOD[:3], "0.02,0.1,0.2"], "line 4: found 3 values, expected 7; is the file cut short?"),
         ([*GOOD[:3], "0.02,0.1,0.2,x,1,2,9"], "line 4, gz: found 'x', expected a number"),
         ([*GOOD[:3], "noon,0.1,0.2,0.3,1,2,9"], "line 4, t: found 'noon', expected a number"),
@@ -99,10 +98,8 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
         (GOOD[:1], "rows: found none below the header"),
         (["# nothing else"], "header: found only comments"),
         ([""], "file: found no line"),
-        (
-            [f"{HEADER},{TRUTH_HEADER}", f"0,{ROW},1,2,3,0,0,0,1", f"1,{ROW},1,2,3,0,0,0,0"],
-            "line 3, qx qy qz qw: found norm 0, expected a unit quaternion",
-        ),
+        ([f"{HEADER},{TRUTH_HEADER}", *[f"{k},{ROW},1,2,3,0,0,0,{1 - k}" for k in (0, 1)]],
+         "line 3, qx qy qz qw: ... unit"),
     ],
 )  # fmt: skip
 def test_an_error_is_reported_in_one_line(tmp_path, lines, message):
@@ -110,19 +107,18 @@ def test_an_error_is_reported_in_one_line(tmp_path, lines, message):
     with pytest.raises(ReadError) as caught:
         read_generic_csv(path)
     assert "own.csv" in str(caught.value)
-    assert message in str(caught.value)
+    assert all(part in str(caught.value) for part in message.split(" ... "))
     assert "\n" not in str(caught.value)
 
 
-def test_rows_with_more_values_than_titles_are_told(tmp_path, caplog):
+def test_rows_with_too_many_values_are_told_and_those_with_blank_ends_stay_separate(
+    tmp_path, caplog
+):
     rows = [f"{0.01 * k:.2f},{ROW}" + (",7" if k in {3, 5} else ",") for k in range(8)]
     read = read_generic_csv(write_lines(tmp_path / "own.csv", HEADER, *rows))
     assert len(read) == 8
     assert "line 5 and 1 others" in caplog.text
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
-
-
-def test_rows_that_begin_and_end_with_blank_cells_stay_separate(tmp_path):
     header = f"{TRUTH_HEADER},{HEADER},note"
     truths = ["1,2,3,0,0,0,1", ",,,,,,", " , , ,,,,", "4,5,6,0,0,0,1"]
     rows = [f"{truth},{0.01 * k:.2f},{ROW}," for k, truth in enumerate(truths)]
@@ -132,51 +128,33 @@ def test_rows_that_begin_and_end_with_blank_cells_stay_separate(tmp_path):
     assert read.truth.time.tolist() == [0.0, 0.03]
 
 
-def test_an_outlying_time_does_not_lose_the_truth_after_it(tmp_path):
-    rows = [f"{0.01 * k + 1e6 * (k == 3)},{ROW},{k},0,1,0,0,0,1" for k in range(10)]
-    truth = read_generic_csv(
-        write_lines(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
-    ).truth
-    assert truth.position_W[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
-
-
 @pytest.mark.parametrize("names", ["x,y,z,qx,qy,qz,qw", "qx,qy,qz,qw", "pos_x_m,pos_y_m,pos_z_m"])
 def test_unread_columns_that_look_like_truth_give_a_warning(tmp_path, caplog, names):
-    count = names.count(",") + 1
-    path = write_lines(
-        tmp_path / "own.csv", f"{HEADER},note,{names}", f"0,{ROW}" + ",1" * (count + 1)
-    )
-    assert read_generic_csv(path).truth is None
+    cells = f"0,{ROW}" + ",1" * (names.count(",") + 2)
+    path = write_lines(tmp_path / "own.csv", f"{HEADER},note,{names}", cells)
+    with caplog.at_level(logging.INFO):
+        assert read_generic_csv(path).truth is None
+    assert "columns ignored: note" in caplog.text
     (record,) = (r for r in caplog.records if r.levelno == logging.WARNING)
     assert f"no ground truth is read from {names.replace(',', ', ')}: " in record.getMessage()
 
 
 def test_a_unit_named_in_the_header_is_not_converted_again(tmp_path):
     header = "t,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"
-    read = read_generic_csv(write_lines(tmp_path / "named.csv", header, *GOOD[1:]))
-    for options in ({"gyro_unit": "deg/s"}, {"accel_unit": "-g"}):
-        with pytest.raises(InputError, match=r"for named, whose file names its unit, .*omit the"):
-            with_units(read, **options)
-    down = write_lines(tmp_path / "down.csv", header.replace("[g]", "[-g]"), *GOOD[1:])
-    with pytest.raises(InputError, match=r"for down, whose sign was already turned .*omit the"):
-        with_units(read_generic_csv(down), accel_unit="-m/s^2")
-    assert np.array_equal(with_units(read).gyro, read.gyro)
-    plain = read_generic_csv(write_lines(tmp_path / "plain.csv", *GOOD))  # SI may be overridden
-    assert np.allclose(with_units(plain, gyro_unit="deg/s").gyro, np.radians(plain.gyro))
-
-
-def test_column_order_is_free_and_unknown_columns_are_ignored(tmp_path, caplog):
-    path = write_lines(
-        tmp_path / "order.csv",
-        "# phone in the left hand",
-        "",
-        "activity,az,ay,ax,temperature [C],gz,gy,gx,qw,t [ms]",
-        "walk,9.0,2.0,1.0,30,0.3,0.2,0.1,1,1000",
-        "stand, 9.0, 2.0 ,1.0,,0.3,0.2,0.1,1,1010",
+    named, down, plain = (
+        read_generic_csv(write_lines(tmp_path / f"{name}.csv", titles, *GOOD[1:]))
+        for name, titles in (
+            ("named", header),
+            ("down", header.replace("[g]", "[-g]")),
+            ("plain", HEADER),
+        )
     )
-    with caplog.at_level(logging.INFO):
-        read = read_generic_csv(path)
-    assert "columns ignored: activity, temperature, qw" in caplog.text
-    assert read.time.tolist() == [0.0, 0.01]
-    assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
-    assert np.allclose(read.accel, [1.0, 2.0, 9.0])
+    for read, options, words in (
+        (named, {"gyro_unit": "deg/s"}, "named, whose file names its unit.*omit"),
+        (named, {"accel_unit": "-g"}, "named, whose file names its unit.*omit"),
+        (down, {"accel_unit": "-m/s^2"}, "down, whose sign was already turned.*omit"),
+    ):
+        with pytest.raises(InputError, match=words):
+            with_units(read, **options)
+    assert np.array_equal(with_units(named).gyro, named.gyro)
+    assert np.allclose(with_units(plain, gyro_unit="deg/s").gyro, np.radians(plain.gyro))

@@ -18,16 +18,12 @@ def walk():
 
 def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(walk, tmp_path):
     """Its truth has columns of gyroscope and accelerometer: their biases."""
-    write_euroc(tmp_path / "V1", walk)
-    (tmp_path / "V1/mav0/imu0/data.csv").unlink()
-    truth = tmp_path / "V1/mav0/state_groundtruth_estimate0/data.csv"
-    axes = [f"b_{s}_RS_S_{axis}" for s in "wa" for axis in "xyz"]
+    imu, truth = write_euroc(tmp_path / "V1", walk)
+    imu.unlink()
     header, *poses = truth.read_text().splitlines()
-    lines = [
-        ",".join([header, *axes]),
-        *(f"{row},{k % 7},2,3,4,5,6" for k, row in enumerate(poses)),
-    ]
-    truth.write_text("\n".join(lines))
+    biases = ",".join(f"b_{s}_RS_S_{axis}" for s in "wa" for axis in "xyz")
+    rows = [f"{row},{k % 7},2,3,4,5,6" for k, row in enumerate(poses)]
+    truth.write_text("\n".join([f"{header},{biases}", *rows]))
     assert find_recordings(tmp_path) == [tmp_path / "V1"]
     with pytest.raises(ReadError, match=r"V1: mav0/imu0/data\.csv: found no such file"):
         read_recording(tmp_path / "V1")
@@ -36,9 +32,7 @@ def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(walk, tmp_
 def test_an_empty_file_in_a_folder_is_named(tmp_path):
     (tmp_path / "dan/processed").mkdir(parents=True)
     (tmp_path / "dan/processed/data.csv").touch()
-    with pytest.raises(
-        ReadError, match=r"processed/data\.csv holds no line of text, .* is it empty"
-    ):
+    with pytest.raises(ReadError, match=r"processed/data\.csv .* empty"):
         read_recording(tmp_path / "dan")
 
 
@@ -50,9 +44,8 @@ def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk, tmp_path):
     save(folder / "accelerometer.csv", "", walk.time, walk.accel)
     save(folder / "imu-gyro.csv", "", walk.time, code, walk.gyro, walk.accel)
     (folder / "gyro.csv").touch()
-    with pytest.raises(ReadError, match=r"iphone: sensors: found only accel, .*gyro\.csv") as error:
+    with pytest.raises(ReadError, match=r"only accel, .*gyro\.csv.*no rows"):
         read_recording(tmp_path / "advio-01")
-    assert "no rows with a time that grows" in str(error.value)
 
 
 def test_a_sensor_file_without_permission_is_named(walk, tmp_path, monkeypatch):
@@ -69,7 +62,7 @@ def test_a_line_of_words_among_rows_is_named_with_the_remedy(walk, tmp_path):
     imu, *_ = write_euroc(tmp_path / "V1", walk)
     lines = imu.read_text().splitlines()
     imu.write_text("\n".join([*lines[:9], "recording paused", *lines[9:]]))
-    with pytest.raises(ReadError, match=r"line 10: found 1 values, .*, or remove the line"):
+    with pytest.raises(ReadError, match=r"line 10: .*remove the line"):
         read_recording(tmp_path / "V1")
 
 
@@ -80,19 +73,15 @@ def test_poses_out_of_order_are_counted(walk, tmp_path, caplog):
         "\n".join([header, *poses[:100], *poses[150:200], *poses[100:150], *poses[200:]])
     )
     found = read_recording(tmp_path / "V1").truth
-    assert found is not None
     assert len(found) == len(poses) - 50
     assert f"dropped 50 of {len(poses)} poses: their times do not increase" in caplog.text
 
 
 def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position(tmp_path, walk):
     imu, *_ = write_euroc(tmp_path / "V1", walk)
-    header, *rows = imu.read_text().splitlines()
-    titles = header.split(",")
-    swapped = [",".join([*titles[:1], *titles[3:0:-1], *titles[4:]])]
-    for cells in (row.split(",") for row in rows):
-        swapped.append(",".join([*cells[:1], *cells[3:0:-1], *cells[4:]]))
+    rows = [line.split(",") for line in imu.read_text().splitlines()]
+    swapped = [",".join([row[0], *row[3:0:-1], *row[4:]]) for row in rows]
     imu.write_text("\n".join(swapped) + "\n")
-    with pytest.raises(ReadError, match=r"header: found .*, expected time, gyroscope xyz and acc"):
+    with pytest.raises(ReadError, match=r"header: .*, expected time, gyroscope xyz and acc"):
         read_recording(tmp_path / "V1")
     np.testing.assert_allclose(read_recording(imu, format="csv").gyro, walk.gyro)

@@ -4,9 +4,6 @@ Names, units and where they stand, order of the columns, separators, decimal mar
 encodings and lines above the titles are drawn at random, all at once.
 """
 
-from dataclasses import dataclass, field
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -54,81 +51,45 @@ FIELDS = {1.0: ("", "uT", "µT", "microtesla"), 1e-6: ("T",), 1e3: ("nT",), 0.01
 """Units by their number in one SI unit (uT for fields)."""
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A column's title, its unit and its text in each row."""
-
-    title: str
-    unit: str
-    cells: list[str] = field(repr=False)
-
-
-@dataclass(frozen=True)
-class Text:
-    """How a table is written: see the module."""
-
-    columns: list[Quantity]
-    units: str
-    separator: str
-    decimal: str
-    quote: str
-    encoding: str
-    line_end: str
-    above: tuple[str, ...]
-    comment: str
-
-    def write(self, path: Path) -> Path:
-        def row(cells: list[str]) -> str:
-            return self.separator.join(f"{self.quote}{cell}{self.quote}" for cell in cells)
-
-        opening, closing = self.units[:1], self.units[1:]
-        units = [column.unit for column in self.columns]
-        titles = [column.title for column in self.columns]
-        titles[0] = self.comment + titles[0]
-        lines = [*self.above, row(titles), row(units)]
-        if self.units != "below":
-            titled = zip(titles, units, strict=True)
-            lines[-2:] = [row([t + (f" {opening}{u}{closing}" if u else "") for t, u in titled])]
-        for cells in zip(*(column.cells for column in self.columns), strict=True):
-            lines.append(row([cell.replace(".", self.decimal) for cell in cells]))
-        content = self.line_end.join(lines) + self.line_end
-        try:
-            path.write_bytes(content.encode(self.encoding))
-        except UnicodeEncodeError:  # Latin-1 has few signs
-            path.write_bytes(content.encode())
-        return path
-
-
 @st.composite
-def texts(draw: st.DrawFn, names: str) -> Text:
+def tables(draw: st.DrawFn, names: str) -> tuple[bytes, bool]:
+    """The content of a table, and whether it has a magnetic field."""
+
+    def one_of(choices):
+        return draw(st.sampled_from(list(choices)))
+
     clocks, *sensors = NAMES[names]
-    unit = draw(st.sampled_from(list(SECONDS)))
-    time = [f"{SECONDS[unit] * t:.3f}" for t in TIME.tolist()]
-    columns = [Quantity(draw(st.sampled_from(clocks)), unit, time)]
+    unit = one_of(SECONDS)
+    columns = [(one_of(clocks), unit, [f"{SECONDS[unit] * t:.3f}" for t in TIME.tolist()])]
     given_units = [RATES, FORCES, FIELDS][: draw(st.integers(2, 3))]
     measured = zip(sensors, given_units, (GYRO, ACCEL, FIELD), strict=False)
     for titles, units, values in measured:
-        factor = draw(st.sampled_from(list(units)))
-        unit, title = draw(st.sampled_from(units[factor])), draw(st.sampled_from(titles))
+        factor = one_of(units)
+        unit, title = one_of(units[factor]), one_of(titles)
         for axis, column in zip("xyz", factor * values.T, strict=True):
-            name = title.replace("#", draw(st.sampled_from([axis, axis.upper()])))
-            columns.append(Quantity(name, unit, list(map(repr, column.tolist()))))
+            name = title.replace("#", one_of([axis, axis.upper()]))
+            columns.append((name, unit, list(map(repr, column.tolist()))))
     if draw(st.booleans()):
-        columns.append(Quantity("note", "", ["left hand"] * COUNT))
-    separator, quote = draw(st.sampled_from([",", ";", "\t"])), draw(st.sampled_from(["", '"']))
-    units = draw(st.sampled_from(["[]", "()", "below"]))
-    commented = names == "csv" and not quote and units != "below"
-    return Text(
-        columns=draw(st.permutations(columns)),
-        units=units,
-        separator=separator,
-        decimal=draw(st.sampled_from([".", ","])) if quote or separator != "," else ".",
-        quote=quote,
-        encoding=draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "latin-1"])),
-        line_end=draw(st.sampled_from(["\n", "\r\n"])),
-        above=draw(st.sampled_from([(), ("# left hand", "", "# again"), (f"sep={separator}",)])),
-        comment=draw(st.sampled_from(["", "#", "# "])) if commented else "",
-    )
+        columns.append(("note", "", ["left hand"] * COUNT))
+    separator, quote, place = one_of([",", ";", "\t"]), one_of(["", '"']), one_of(["[]", "()", ""])
+    decimal = one_of([".", ","]) if quote or separator != "," else "."
+    titles, units, cells = map(list, zip(*draw(st.permutations(columns)), strict=True))
+    if names == "csv" and not quote and place:
+        titles[0] = one_of(["", "#", "# "]) + titles[0]
+    rows = [titles, units]
+    if place:  # else below the titles
+        opening, closing = place
+        titled = zip(titles, units, strict=True)
+        rows = [[title + (f" {opening}{u}{closing}" if u else "") for title, u in titled]]
+    rows += [[cell.replace(".", decimal) for cell in row] for row in zip(*cells, strict=True)]
+    lines = [separator.join(f"{quote}{cell}{quote}" for cell in row) for row in rows]
+    lines = [*one_of([(), ("# left hand", "", "# again"), (f"sep={separator}",)]), *lines, ""]
+    text = one_of(["\n", "\r\n"]).join(lines)
+    encoding = one_of(["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+    try:
+        return text.encode(encoding), len(given_units) == 3
+    except UnicodeEncodeError:  # Latin-1 has few signs
+        return text.encode(), len(given_units) == 3
 
 
 def close(read: FloatArray, written: FloatArray) -> None:
@@ -140,9 +101,10 @@ def test_a_table_is_read_back(names, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
 
     @settings(max_examples=40, deadline=None)
-    @given(texts(names))
-    def check(text):
-        path = text.write(folder / "own.csv")
+    @given(tables(names))
+    def check(table):
+        path = folder / "own.csv"
+        path.write_bytes(table[0])
         assert find_recordings(path) == [path]
         read = read_recording(path)
         close(read.time, TIME)
@@ -150,6 +112,6 @@ def test_a_table_is_read_back(names, tmp_path_factory):
         close(read.accel, ACCEL)
         if read.magnetometer is not None:
             close(read.magnetometer.field, FIELD)
-        assert (read.magnetometer is None) == (len(text.columns) < 10)
+        assert (read.magnetometer is not None) == table[1]
 
     check()

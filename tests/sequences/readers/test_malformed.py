@@ -206,7 +206,7 @@ def test_invalid_or_missing_logger_files_are_refused(tmp_path, walks):
     assert_refused(path, "Gyroscope.csv: header, ", "found unit 'rpm', expected rad/s, deg/s")
     gyro.unlink()
     assert_refused(path, "sensors: found only accel and mag, expected a gyroscope")
-    with pytest.raises(ReadError, match=r"files: found Accelerometer\.csv, .*, expected a gyrosc"):
+    with pytest.raises(ReadError, match=r"Accelerometer\.csv, .* gyroscope"):
         read_recording(path, format="phone")
 
 

@@ -5,25 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from csv_lines import ROW, write_lines
 
 from stario.sequences import ReadError, find_recordings, read_recording
 from stario.sequences.readers.columns import HEADER
 
-ROW = "0.1,0.2,0.3,1.5,2.5,9.25"
 ROWS = [f"{0.01 * k:.2f},{ROW}" for k in range(6)]
 
 
-def write(path: Path, *lines: str, encoding: str = "utf-8") -> Path:
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes("\n".join(lines).encode(encoding) + "\n".encode(encoding)[-2:])
-    return path
-
-
-def phone(folder: Path, gyro: list[str], accel: list[str], encoding: str = "utf-8") -> Path:
+def phone(folder: Path, gyro: list[str], accel: list[str]) -> Path:
+    folder.mkdir(exist_ok=True)
     for name, rows in (("Gyroscope", gyro), ("Accelerometer", accel)):
-        lines = "\n".join(["time,x,y,z", *rows]) + "\n"
-        folder.mkdir(exist_ok=True)
-        (folder / f"{name}.csv").write_bytes(lines.encode(encoding))
+        write_lines(folder / f"{name}.csv", "time,x,y,z", *rows)
     return folder
 
 
@@ -43,7 +36,7 @@ def test_cells_without_a_value_are_blank(tmp_path, missing):
     rows = [f"{row},{missing},{missing},{missing}" for row in ROWS]
     rows[3] = f"{ROWS[3]},1,2,3"
     rows.insert(3, ",".join(["0.025", *[missing] * 6, "4", "5", "6"]))
-    read = read_recording(write(tmp_path / "own.csv", header, *rows))
+    read = read_recording(write_lines(tmp_path / "own.csv", header, *rows))
     assert len(read) == len(ROWS)
     assert read.magnetometer.field.tolist() == [[4, 5, 6], [1, 2, 3]]
 
@@ -80,7 +73,7 @@ def test_a_blank_cell_of_a_phones_sensor_loses_only_its_sample(tmp_path, cell, c
 def test_thousands_are_not_taken_for_fractions(tmp_path):
     rows = [f'"{time}",0.1,0.2,0.3,1.5,2.5,9.25' for time in ("995", "1,000", "1,005")]
     with pytest.raises(ReadError, match="line 3, t"):
-        read_recording(write(tmp_path / "own.csv", HEADER.replace("t [s]", "t [ms]"), *rows))
+        read_recording(write_lines(tmp_path / "own.csv", HEADER.replace("t [s]", "t [ms]"), *rows))
 
 
 @pytest.mark.parametrize("cut", ["0.06,0.1", ""])

@@ -6,8 +6,7 @@ from csv_lines import write_lines
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from stario.sequences.errors import ReadError
-from stario.sequences.readers import read_recording
+from stario.sequences import ReadError, read_recording
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.table_head import table_heads
 from stario.sequences.sequence import FloatArray

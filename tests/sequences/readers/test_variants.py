@@ -9,13 +9,7 @@ import pytest
 from alike import max_angle
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import InputError
-from stario.sequences.readers import find_recordings, read_recording
-
-
-def relative_to_first(attitude: Rotation) -> Rotation:
-    """Attitude relative to its first sample."""
-    return attitude[0].inv() * attitude
+from stario.sequences import InputError, find_recordings, read_recording
 
 
 def assert_truth_is_read(recording: formats.Written) -> None:
@@ -44,7 +38,8 @@ def test_ronin_uses_the_attitude_source_that_its_authors_use(tmp_path, walks, er
     limit = 2e-3 if source == "gyro" else 1e-6
     assert max_angle(attitude, true[100:]) < limit
     if source == "gyro":
-        assert max_angle(relative_to_first(attitude), relative_to_first(true[100:])) > 1e-9
+        turned, true = (one[0].inv() * one for one in (attitude, true[100:]))
+        assert max_angle(turned, true) > 1e-9
 
 
 def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks):
@@ -56,12 +51,15 @@ def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks):
     assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 2e-3
 
 
-def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks):
+def test_poses_of_the_odometry_and_those_in_a_world_with_z_up_are_read(tmp_path, walks):
     recording = formats.rnin(tmp_path, walks(200.0), captured=False)
     assert_truth_is_read(recording)
     csv = recording.path / "SenseINS.csv"
     csv.write_text(csv.read_text().replace("times,", "time,", 1))
     assert np.array_equal(read_recording(csv).gyro, read_recording(recording.path).gyro)
+    # RIDI's raw folders contain IMUNet's files, from a Tango.
+    recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
+    assert_truth_is_read(recording)
 
 
 def test_tlio_quaternion_order_is_that_of_the_column_name(tmp_path, walks):
@@ -80,12 +78,6 @@ def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks):
     alone = read_recording(recording.path.parent)
     assert alone.truth is None
     assert np.abs(alone.accel - recording.expected.accel).max() < 1e-9
-
-
-def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks):
-    """RIDI's raw folders contain IMUNet's files, from a Tango."""
-    recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
-    assert_truth_is_read(recording)
 
 
 def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path, walks):

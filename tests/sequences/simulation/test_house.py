@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import InputError
 from stario.sequences.geodesy import Georeference, east_north, turned
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.simulation.house import SHORTEST, simulate_house
@@ -14,7 +13,6 @@ from stario.sequences.simulation.outside_sensors import (
     simulate_barometer,
     simulate_satellites,
 )
-from stario.sequences.simulation.walks import WalkStyle
 from stario.sequences.units import standard_pressure
 
 METRES_PER_HPA = 8.43
@@ -35,7 +33,7 @@ def height(pressure_hPa: FloatArray) -> FloatArray:
     return METRES_PER_HPA * (pressure_hPa[0] - pressure_hPa)
 
 
-def test_each_stay_is_on_the_level_of_its_floor(walk):
+def test_each_stay_is_on_the_level_of_its_floor_which_its_waypoints_name(walk):
     truth = walk.sequence.truth
     assert len({stay.floor for stay in walk.stays}) > 1
     ground = truth.slice(0.0, walk.stays[0].stop).position_W[:, 2].mean()
@@ -43,6 +41,9 @@ def test_each_stay_is_on_the_level_of_its_floor(walk):
         level = truth.slice(stay.start + 1.0, stay.stop - 1.0).position_W[:, 2]
         assert level.mean() - ground == pytest.approx(3.0 * stay.floor, abs=0.1)
         assert level.std() < 0.05
+    known = walk.sequence.positions
+    np.testing.assert_array_equal(known.floor, np.repeat([s.floor for s in walk.stays[1:]], 2))
+    np.testing.assert_allclose(known.time, [t for s in walk.stays[1:] for t in (s.start, s.stop)])
 
 
 def test_the_shortest_walk_changes_floors():
@@ -50,12 +51,6 @@ def test_the_shortest_walk_changes_floors():
         stays = simulate_house(seed, SHORTEST, rate=20.0).stays
         assert any(one.floor != stays[0].floor for one in stays)
         assert stays[-1].stop == SHORTEST
-
-
-def test_waypoints_name_the_floor_at_both_ends_of_a_stay(walk):
-    known = walk.sequence.positions
-    np.testing.assert_array_equal(known.floor, np.repeat([s.floor for s in walk.stays[1:]], 2))
-    np.testing.assert_allclose(known.time, [t for s in walk.stays[1:] for t in (s.start, s.stop)])
 
 
 @pytest.mark.parametrize("way", ["stairs", "lift"])
@@ -104,16 +99,13 @@ def test_errors_of_satellites_last_and_are_larger_between_houses():
         assert kept == pytest.approx(share, abs=0.15)
 
 
-def test_a_receiver_indoors_repeats_its_last_position(walk):
+def test_a_receiver_agrees_on_where_north_is_and_repeats_its_last_position_indoors(walk):
     found, entered = walk.sequence.satellites, walk.stays[0].stop
     indoors = found.time > entered
     assert 30 < indoors.sum() < len(found) - 20
     assert (found.latlon_deg[indoors] == found.latlon_deg[~indoors][-1]).all()
     assert (found.radius_m[indoors] == 9.0).all()
     assert (np.diff(found.latlon_deg[~indoors], axis=0) != 0.0).all()
-
-
-def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     truth, entered = walk.sequence.truth, walk.stays[0].stop
     there = Georeference(48.0, 11.0, yaw=-0.4)
     found = simulate_satellites(truth, there, sigma=0.0).slice(1.0, entered - 1.0)
@@ -125,13 +117,3 @@ def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     assert np.sqrt(np.mean(np.square(moved))) > 0.5
     true = truth.at(found.time).position_W
     np.testing.assert_allclose(place, turned((true - true[0])[:, :2], there.yaw), atol=0.02)
-
-
-def test_a_walk_too_short_for_a_house_is_refused():
-    with pytest.raises(InputError, match="duration: found 30 s, expected at least 120 s"):
-        simulate_house(0, 30.0)
-
-
-def test_a_trolley_takes_no_stairs():
-    with pytest.raises(InputError, match="trolley"):
-        simulate_house(0, style=WalkStyle(carry="trolley"))

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences import ImuSequence, PositionTrack
+from stario.sequences import STANDARD_GRAVITY, ImuSequence, MagneticField, PositionTrack
 from stario.sequences.attitude.rotations import GyroIntegral
-from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation import insertion
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
-from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.moments import MOMENTS
 from stario.sequences.simulation.outside_sensors import simulate_barometer, simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -116,14 +114,11 @@ def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk):
     np.testing.assert_allclose(np.arctan2(standing[:, 1], standing[:, 0]), 0.0, atol=0.2)
 
 
-def test_the_gyroscope_keeps_its_bias(walk):
+def test_the_gyroscope_keeps_its_bias_and_errors_of_scale_grow_with_the_rotation(walk):
     bias = np.array([0.03, -0.02, 0.01])
     part = within(inserted(replace(walk, gyro=walk.gyro + bias), "table"))
     lying = (part.time > part.time[0] + 5.0) & (part.time < part.time[0] + 15.0)
     np.testing.assert_allclose(part.gyro[lying].mean(axis=0), bias, atol=2e-3)
-
-
-def test_errors_of_scale_and_alignment_grow_with_the_rotation():
     found = inserted(walk_of(PHONE_IMU), "shake 25 s")
     whole = found.sequence
     ends = np.array([found.start, found.stop])
@@ -133,25 +128,22 @@ def test_errors_of_scale_and_alignment_grow_with_the_rotation():
     assert np.degrees(wrong) > 5.0
 
 
-def test_known_positions_after_the_moment_come_later(walk):
+def test_pressure_goes_on_in_a_moment_and_known_positions_after_it(walk):
     time = np.array([2.0, 8.0, 15.0])
     known = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
-    without = replace(walk, truth=None, positions=known)
-    found = insert_moment(without, walk.truth, BY_NAME["table"], 0.5, seed=1).sequence
-    np.testing.assert_allclose(found.positions.time, [2.0, 8.0, 35.0])
-    np.testing.assert_allclose(found.positions.position_W, known.position_W)
-
-
-def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk):
     full = replace(
         walk,
+        truth=None,
+        positions=known,
         barometer=simulate_barometer(walk.truth, weather=0.0, door=0.0, noise=0.02),
         satellites=simulate_satellites(walk.truth),
     )
     found = insert_moment(full, walk.truth, BY_NAME["table"], 0.5, seed=1)
+    np.testing.assert_allclose(found.sequence.positions.time, [2.0, 8.0, 35.0])
+    np.testing.assert_allclose(found.sequence.positions.position_W, known.position_W)
     pressure, reported = found.sequence.barometer, found.sequence.satellites
     assert np.diff(pressure.time).max() < 0.3
-    true = found.sequence.truth.at(pressure.time).position_W[:, 2]
+    true = inserted(walk, "table").sequence.truth.at(pressure.time).position_W[:, 2]
     height = METRES_PER_HPA * (pressure.pressure_hPa[0] - pressure.pressure_hPa)
     np.testing.assert_allclose(height - height.mean(), true - true.mean(), atol=0.2)
     late = full.satellites.time >= found.start

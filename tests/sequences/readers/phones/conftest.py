@@ -1,7 +1,6 @@
 import pytest
 
-from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences import PERFECT_IMU, WalkStyle, generate_walk, simulate_imu
 
 
 @pytest.fixture(scope="session")

@@ -30,8 +30,7 @@ def test_two_recordings_in_a_zip_are_named(walk, tmp_path):
         for one in (tmp_path / "s").iterdir():
             file.write(one, f"a/{one.name}")
             file.write(one, f"b/{one.name}")
-    expected = r"two\.zip: content: found 2 recordings \(a, b\), expected one; unpack the zip"
-    with pytest.raises(ReadError, match=rf"^[^:]*/{expected}$"):
+    with pytest.raises(ReadError, match=r"two\.zip: .* \(a, b\), .*unpack the zip"):
         read_recording(tmp_path / "two.zip")
 
 
@@ -44,8 +43,7 @@ def test_a_count_of_rows_is_no_time(first, walk, tmp_path):
         save(tmp_path / f"titled/{name}.csv", "time,x,y,z", count, values)
         save(tmp_path / f"bare/{name}.csv", "", count, values)
     for name, title in (("wide.csv", "timestamp"), ("titled", "time"), ("bare", "time")):
-        message = rf"{title}: found {first}, {first + 1}, .*, which counts the rows, expected times"
-        with pytest.raises(ReadError, match=message):
+        with pytest.raises(ReadError, match=rf"{title}: found {first}, .* counts the rows"):
             read_recording(tmp_path / name)
 
 
@@ -67,13 +65,15 @@ def test_a_malformed_json_export_is_refused_in_one_line(text, message, tmp_path)
 
 
 def test_a_sensors_file_without_samples_is_named(walk, tmp_path, caplog):
+    """One of another sensor than the gyroscope's is no name of a recording."""
     save_zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
     (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
-    lacking = "no rows with a time that grows and three values"
-    message = rf"found only gyro, expected .*; TotalAcceleration\.csv: {lacking}$"
-    with pytest.raises(ReadError, match=message):
+    with pytest.raises(ReadError, match=r"only gyro, .*TotalAcceleration\.csv: no rows"):
         read_recording(tmp_path)
     save_zyx(tmp_path, walk, TotalAcceleration=walk.accel)
+    with pytest.raises(ReadError, match=r"one sensor of .*gyroscope: .*/Gyroscope\.csv$"):
+        read_recording(tmp_path / "TotalAcceleration.csv")
+    assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
     (tmp_path / "Gyroscope.csv").write_text("")
     read_recording(tmp_path)
     assert "Gyroscope.csv: not read: it has no rows" in caplog.text
@@ -81,23 +81,13 @@ def test_a_sensors_file_without_samples_is_named(walk, tmp_path, caplog):
 
 def test_samples_without_an_accelerometer_are_counted(walk, tmp_path, caplog):
     """It stopped halfway, say; that it starts a little late needs no mention."""
-    for part, dropped in ((slice(10, None), False), (slice(0, 751), True)):
-        save_zyx(tmp_path, walk, Gyroscope=walk.gyro)
-        save_zyx(
-            tmp_path, walk.select(np.arange(len(walk))[part]), TotalAcceleration=walk.accel[part]
-        )
-        caplog.clear()
+    save_zyx(tmp_path, walk, Gyroscope=walk.gyro)
+    for part, words in ((slice(10, None), ""), (slice(0, 751), "dropped 750 of 1501 samples")):
+        kept = walk.select(np.arange(len(walk))[part])
+        save_zyx(tmp_path, kept, TotalAcceleration=kept.accel)
         read_recording(tmp_path)
-        assert ("dropped 750 of 1501 samples at whose times only" in caplog.text) == dropped
-        assert ("dropped" in caplog.text) == dropped
-
-
-def test_a_file_of_one_sensor_names_that_of_the_gyroscope(walk, tmp_path):
-    save_zyx(tmp_path, walk, Gyroscope=walk.gyro, TotalAcceleration=walk.accel)
-    message = r"found one sensor of a recording, .*; name its gyroscope: .*/Gyroscope\.csv$"
-    with pytest.raises(ReadError, match=message):
-        read_recording(tmp_path / "TotalAcceleration.csv")
-    assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
+        assert words in caplog.text
+        assert ("dropped" in caplog.text) == bool(words)
 
 
 def test_single_wild_samples_are_no_reason_to_refuse_a_file(walk, tmp_path):
@@ -115,14 +105,15 @@ def test_single_wild_samples_are_no_reason_to_refuse_a_file(walk, tmp_path):
 
 
 def test_a_clock_in_another_unit_than_its_title_says(walk, tmp_path):
-    for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
-        save(tmp_path / f"{name}.csv", "t [s],x,y,z", ns(walk), values)
-    with pytest.raises(ReadError, match=r"time: found .*; is its unit the one that the header"):
-        read_recording(tmp_path)
-    for name, values, late in (("Gyroscope", walk.gyro, 5), ("TotalAcceleration", walk.accel, 0)):
-        save(tmp_path / f"{name}.csv", "t [s],x,y,z", 1e3 * walk.time + late, values)
-    with pytest.raises(ReadError, match=r"found samples 10 s apart, .*; is its unit"):
-        read_recording(tmp_path)
+    late = 1e3 * walk.time + 5
+    for gyro_time, accel_time, words in (
+        (ns(walk), ns(walk), "time: .*is its unit the one that the header"),
+        (late, late - 5, "10 s apart, .*is its unit"),
+    ):
+        save(tmp_path / "Gyroscope.csv", "t [s],x,y,z", gyro_time, walk.gyro)
+        save(tmp_path / "TotalAcceleration.csv", "t [s],x,y,z", accel_time, walk.accel)
+        with pytest.raises(ReadError, match=words):
+            read_recording(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Pressure next to the sensors of a phone's recording, and in lines of events."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,7 @@ HPA = 1013.25 - 0.01 * TIME
 
 
 def pressure_of(path: Path) -> Barometer:
-    found = read_recording(path).barometer
-    assert found is not None
-    return found
+    return read_recording(path).barometer
 
 
 def assert_pressure(found: Barometer, time: FloatArray, pressure_hPa: FloatArray) -> None:
@@ -51,15 +50,18 @@ def test_pressure_is_read_in_the_unit_of_its_title_or_else_of_its_size(
     assert_pressure(pressure_of(tmp_path / "p"), TIME, HPA)
 
 
-def test_pressure_without_titles_is_read(walk, tmp_path):
+def test_pressure_without_titles_is_read_but_a_walk_through_a_bar_is_none(walk, tmp_path):
     export("prefixed", tmp_path / "p", walk)
     stamps = [f"{1606391908305 + 1e3 * t:.18e}" for t in TIME]
     rows = [f"{t} {p:.18e}" for t, p in zip(stamps, HPA, strict=True)]
     (tmp_path / "p/Eight_bar.csv").write_text("\n".join(rows) + "\n")
     assert_pressure(pressure_of(tmp_path / "p"), TIME, HPA)
+    for sensor, values in (("gyr", walk.gyro), ("acc", walk.accel)):
+        save(tmp_path / f"bar_{sensor}.csv", "time (s),x,y,z", walk.time, values)
+    assert read_recording(tmp_path / "bar_gyr.csv").barometer is None
 
 
-def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk, tmp_path):
+def test_pressure_is_on_the_sensors_clock_and_read_once_where_every_row_repeats_it(walk, tmp_path):
     export("sensor_logger", tmp_path / "s", walk)
     time = np.append(-3.0, TIME)  # delivered before the first sample of the others
     stamps = [START_NS + round(t * 1e9) for t in time]
@@ -67,9 +69,6 @@ def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk, tmp_path):
     columns = [stamps, time, np.zeros(13), np.append(1013.0, HPA)]
     save(tmp_path / "s/Barometer.csv", header, *columns)
     assert_pressure(pressure_of(tmp_path / "s"), TIME, HPA)
-
-
-def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(walk, tmp_path):
     names = [f"{sensor} {axis}" for sensor in ("ACCELEROMETER", "GYROSCOPE") for axis in "XYZ"]
     header = ",".join(["time (s)", *names, "ATMOSPHERIC PRESSURE (hPa)"])
     held = 1013.0 - 0.01 * np.floor(walk.time)
@@ -83,45 +82,28 @@ def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(walk, tmp_pa
 @pytest.mark.parametrize(
     ("title", "values", "words"),
     [
-        ("altitude", 520.0 + TIME, "altitude: found 526 m, expected pressure of 300 to 1100 hPa"),
-        ("height (m)", 520.0 + TIME, "found 526 m"),
-        ("value", 3.0 + TIME, "value: found 9, expected pressure"),
-        ("value", 520.0 + TIME, "found steps of 1 hPa, which is 8 m of height, expected pressure"),
+        ("altitude", 520.0 + TIME, "altitude: found 526 m, .* 300 to 1100 hPa.*altitude"),
+        ("height (m)", 520.0 + TIME, "found 526 m.*altitude"),
+        ("value", 3.0 + TIME, "value: found 9,.*altitude"),
+        ("value", 520.0 + TIME, "1 hPa, which is 8 m of height.*altitude"),
+        ("pressure (hPa)", HPA, "from 7200 to 7212 s after the first sample"),
     ],
 )
-def test_an_altitude_in_place_of_pressure_is_named_in_one_line(
-    walk, tmp_path, title, values, words, caplog
-):
+def test_what_is_no_pressure_is_named_in_one_line(walk, tmp_path, title, values, words, caplog):
     export("phyphox", tmp_path / "p", walk)
-    save(tmp_path / "p/Barometer.csv", f"time,{title}", TIME, values)
+    time = TIME + (7200.0 if "hPa" in title else 0.0)
+    save(tmp_path / "p/Barometer.csv", f"time (s),{title}", time, values)
     assert read_recording(tmp_path / "p").barometer is None
     [line] = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert words in line
-    assert line.endswith("is it an altitude?")
-
-
-def test_pressure_of_another_clock_is_named_in_one_line(walk, tmp_path, caplog):
-    export("phyphox", tmp_path / "p", walk)
-    save(tmp_path / "p/Barometer.csv", "time (s),pressure (hPa)", TIME + 7200.0, HPA)
-    assert read_recording(tmp_path / "p").barometer is None
-    assert "pressure skipped" in caplog.text
-    assert "found times from 7200 to 7212 s after the first sample" in caplog.text
-
-
-def test_a_walk_through_a_bar_is_no_pressure(walk, tmp_path):
-    for sensor, values in (("gyr", walk.gyro), ("acc", walk.accel)):
-        save(tmp_path / f"bar_{sensor}.csv", "time (s),x,y,z", walk.time, values)
-    assert read_recording(tmp_path / "bar_gyr.csv").barometer is None
+    assert re.search(words, line)
 
 
 def test_lines_of_pressure_satellites_and_floors_are_read(walk, tmp_path):
     export("get_sensor_data", tmp_path / "g", walk)
     read = read_recording(tmp_path / "g/log.txt")
-    assert read.barometer is not None
     assert_pressure(read.barometer, np.array([0.5, 1.5]), np.array([1013.055, 1013.065]))
     found = read.satellites
     np.testing.assert_allclose(found.time, [0.75, 1.75], atol=1e-3)
-    assert found.altitude_m is not None
     np.testing.assert_array_equal(found.altitude_m, [5.5, 6.5])
     stated = (found.bearing_deg, found.radius_m, found.speed_m_s)
     np.testing.assert_array_equal(stated, [[90.0] * 2, [4.5] * 2, [1.25] * 2])

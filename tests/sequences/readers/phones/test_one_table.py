@@ -75,14 +75,10 @@ def test_the_first_of_two_imus_is_read_and_named(titles, words, walk, tmp_path, 
     columns = walk.time, walk.accel, walk.gyro, walk.accel + 1.0, walk.gyro + 1.0
     assert_same_samples(read_recording(table(tmp_path, f"time,{titles}", *columns)), walk)
     assert words in caplog.text
-
-
-def test_two_accelerometers_and_a_gyroscope_of_neither_are_refused(walk, tmp_path):
     columns = walk.time, walk.gyro, walk.accel, walk.accel
-    path = table(tmp_path, "time,gyro_@,acc_wrist_@,acc_hip_@", *columns)
-    message = r"several IMUs \(acc_wrist_x and acc_hip_x\), expected one; keep the columns"
-    with pytest.raises(ReadError, match=message):
-        read_recording(path)
+    neither = table(tmp_path, "time,gyro_@,acc_wrist_@,acc_hip_@", *columns)
+    with pytest.raises(ReadError, match=r"\(acc_wrist_x and acc_hip_x\).*keep"):
+        read_recording(neither)
 
 
 @pytest.mark.parametrize(
@@ -97,23 +93,15 @@ def test_two_accelerometers_and_a_gyroscope_of_neither_are_refused(walk, tmp_pat
 )
 def test_rows_of_several_devices_are_refused(titles, names, walk, tmp_path):
     one = np.repeat(names[0], len(walk))
-    assert_same_samples(
-        read_recording(table(tmp_path, titles, walk.time, one, walk.gyro, walk.accel)), walk
-    )
+    path = table(tmp_path, titles, walk.time, one, walk.gyro, walk.accel)
+    path.write_text(path.read_text() + f"1.0,{names[1]},,,,,,\n")  # a row without IMU samples
+    assert_same_samples(read_recording(path), walk)
     time, gyro, accel = (np.repeat(x, 2, axis=0) for x in (walk.time, walk.gyro, walk.accel))
     time[1::2] += 0.003  # so that no time repeats
     path = table(tmp_path, titles, time, np.tile(names, len(walk)), gyro, accel)
     title = titles.split(",")[1]
-    message = rf"{title}: found several devices \({names[0]}, {names[1]}\), expected one"
-    with pytest.raises(ReadError, match=message):
+    with pytest.raises(ReadError, match=rf"{title}: .* \({names[0]}, {names[1]}\), expected one"):
         read_recording(path)
-
-
-def test_devices_of_rows_without_imu_samples_do_not_count(walk, tmp_path):
-    left = ["left"] * len(walk)
-    file = table(tmp_path, "t [s],device,g@,a@", walk.time, left, walk.gyro, walk.accel)
-    file.write_text(file.read_text() + "1.0,watch,,,,,,\n")
-    assert len(read_recording(file)) == len(walk)
 
 
 # --- rows that name their sensor -------------------------------------------------------------

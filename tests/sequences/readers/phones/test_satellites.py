@@ -34,16 +34,6 @@ def positions_of(path: Path) -> PositionTrack:
     return found
 
 
-@pytest.mark.parametrize("title", ["accuracy", "hAcc (m)", "h_acc", "HACC"])
-def test_the_radius_may_be_named_briefly(walk, tmp_path, title):
-    export("phyphox", tmp_path / "p", walk)
-    radius = np.full(len(TIME), 4.53)
-    save(tmp_path / "p/gps.csv", f"time,lat,lon,{title}", TIME, degrees(METRES), radius)
-    sigma = positions_of(tmp_path / "p").sigma
-    assert sigma is not None
-    np.testing.assert_allclose(sigma, 3.0)
-
-
 def test_positions_of_phyphox_are_read_with_their_accuracy(walk, tmp_path):
     export("phyphox", tmp_path / "p", walk)
     radius = np.where(TIME == 5.0, 200.0, 4.53)  # one from the cells of the network
@@ -53,9 +43,12 @@ def test_positions_of_phyphox_are_read_with_their_accuracy(walk, tmp_path):
     np.testing.assert_allclose(found.time, TIME, atol=1e-9)
     np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
     np.testing.assert_allclose(found.sigma[found.valid], 3.0)
+    assert "11 positions (sigma 3 m" in read_recording(tmp_path / "p").truth_summary()
+    for title in ("accuracy", "hAcc (m)", "h_acc", "HACC"):
+        save(tmp_path / "p/Location.csv", f"time,lat,lon,{title}", TIME, degrees(METRES), radius)
+        known = positions_of(tmp_path / "p")
+        np.testing.assert_allclose(known.sigma[known.valid], 3.0)
     np.testing.assert_array_equal(found.valid, TIME != 5.0)
-    summary = read_recording(tmp_path / "p").truth_summary()
-    assert summary == "11 positions (sigma 3 m per axis) without attitude, no poses"
 
 
 def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(walk, tmp_path):
@@ -86,7 +79,6 @@ def test_positions_repeated_in_every_row_are_read_once(walk, tmp_path):
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     found = positions_of(file)
     np.testing.assert_allclose(found.time, np.arange(1.0, 16.0), atol=0.02)
-    assert found.sigma is not None
     np.testing.assert_allclose(found.sigma, 4.0)
 
 
@@ -102,6 +94,11 @@ def test_each_recording_of_a_folder_has_its_own_positions(walk, tmp_path):
 
 
 def test_dates_of_positions_and_samples_may_be_in_different_zones(walk, tmp_path):
+    def dates(time: FloatArray, hours: int) -> list[list[str]]:
+        start = datetime(2024, 5, 1, 23, 59, 55, tzinfo=UTC)
+        start = start.astimezone(timezone(timedelta(hours=hours)))
+        return [[(start + timedelta(seconds=t)).isoformat()] for t in time.tolist()]
+
     for name, values in (("Accelerometer", walk.accel), ("Gyroscope", walk.gyro)):
         save(tmp_path / f"w/{name}.csv", "time,x,y,z", dates(walk.time, hours=2), values)
     columns = dates(TIME, hours=-3), degrees(METRES), np.full(len(TIME), 4.53)
@@ -109,13 +106,6 @@ def test_dates_of_positions_and_samples_may_be_in_different_zones(walk, tmp_path
     found = positions_of(tmp_path / "w")
     np.testing.assert_allclose(found.time, TIME, atol=1e-6)
     np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
-
-
-def dates(time: FloatArray, hours: int) -> list[list[str]]:
-    """Dates at times [s] after one instant, in a zone so many hours ahead of UTC."""
-    zone = timezone(timedelta(hours=hours))
-    start = datetime(2024, 5, 1, 23, 59, 55, tzinfo=UTC).astimezone(zone)
-    return [[(start + timedelta(seconds=t)).isoformat()] for t in time.tolist()]
 
 
 PLACE = degrees(METRES)
@@ -201,13 +191,10 @@ def test_what_a_receiver_reports_is_kept_as_measured(walk, tmp_path):
     np.testing.assert_allclose(read.positions.latlon_deg, place[:7], atol=1e-12)
 
 
+@pytest.mark.skipif(not DATA.is_dir(), reason="ADVIO is not here")
 def test_a_file_of_advio_without_titles_is_read():
-    path = DATA / "raw/advio/advio-15"
-    if not path.is_dir():
-        pytest.skip("ADVIO is not here")
-    found = read_recording(path).satellites
+    found = read_recording(DATA / "raw/advio/advio-15").satellites
     np.testing.assert_allclose(found.latlon_deg, [[60.187, 24.8215]] * len(found), atol=1e-3)
-    assert found.altitude_m is not None
     assert found.radius_m.min() >= 5.0
     assert found.radius_m.max() <= 200.0
     assert np.ptp(found.altitude_m) < 5.0

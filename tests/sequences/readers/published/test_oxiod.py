@@ -1,6 +1,5 @@
 """OxIOD: rows in step or with clocks of their own, mounted and lagging captures, lost tracking."""
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,9 @@ from alike import assert_same_poses, assert_upright, turned_and_measured
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import ReadError
+from stario.sequences import ImuSequence, ReadError, WalkStyle, generate_walk
 from stario.sequences.readers import find_recordings, read_recording
-from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 TILT_WW = Rotation.from_euler("xy", [0.5, -0.6], degrees=True)
@@ -27,7 +24,8 @@ def walk():
     return simulate_imu(generate_walk(4, 60.0, style=WalkStyle("rig")), 100.0, PERFECT_IMU)
 
 
-def apple_rows(walk: ImuSequence, stamps: list[int] | list[str]) -> list[str]:
+def apple_rows(walk: ImuSequence, stamps: list[int] | list[str] | None = None) -> list[str]:
+    stamps = stamps or formats.stamps_ns(walk.time)
     gravity = walk.truth.attitude_WB.apply([0.0, 0.0, -1.0], inverse=True)
     zeros = np.zeros((len(walk), 3))
     user = walk.accel / -9.81 - gravity
@@ -35,8 +33,9 @@ def apple_rows(walk: ImuSequence, stamps: list[int] | list[str]) -> list[str]:
 
 
 def capture_rows(
-    walk: ImuSequence, every: int, start: int, unit_ns: int, ahead: float, frame: bool = True
-) -> list[str]:
+    walk: ImuSequence, every: int = 1, unit_ns: int = 1, ahead: float = 0.0, frame: bool = True,
+    start: int = formats.START_NS,
+) -> list[str]:  # fmt: skip
     """Every `every`-th row of the truth, stamped by a clock `ahead` seconds ahead."""
     rows = slice(300, -200, every)
     truth = walk.truth
@@ -45,6 +44,14 @@ def capture_rows(
     pose = np.hstack([truth.position_W[rows], (truth.attitude_WB[rows] * MOUNT_VB.inv()).as_quat()])
     frames = [list(range(len(pose)))] if frame else []
     return formats.text(stamps, *frames, pose)
+
+
+def write_raw(folder: Path, imu: list[str], capture: list[str], name: str = "vi1") -> Path:
+    """Write rows with clocks of their own; return the path of the IMU's."""
+    formats.save(folder / "raw/imu1.csv", "", imu)
+    if capture:
+        formats.save(folder / f"raw/{name}.csv", "", capture)
+    return folder / "raw/imu1.csv"
 
 
 # --- rows in step ----------------------------------------------------------------------------
@@ -140,48 +147,40 @@ def assert_matches(path: Path, walk: ImuSequence, tolerance_deg: float = 1.0) ->
 )
 def test_the_capture_is_synchronised_to_the_phones_clock(tmp_path, walk, name, unit_ns, ahead):
     """Nanoseconds, microseconds or milliseconds; seconds apart or of another origin."""
-    raw = tmp_path / "pocket/data1/raw"
-    formats.save(raw / "imu1.csv", "", apple_rows(walk, formats.stamps_ns(walk.time)))
-    every = 3 if name == "tango1" else 1
-    start = formats.stamps_ns(np.zeros(1))[0]
-    rows = capture_rows(walk, every, start, unit_ns, ahead, frame=name != "tango1")
-    formats.save(raw / f"{name}.csv", "", rows)
-    assert_matches(raw / "imu1.csv", walk, 3.0 if name == "tango1" else 1.0)
+    tango = name == "tango1"
+    rows = capture_rows(walk, 3 if tango else 1, unit_ns, ahead, frame=not tango)
+    path = write_raw(tmp_path / "pocket/data1", apple_rows(walk), rows, name)
+    assert_matches(path, walk, 3.0 if tango else 1.0)
 
 
 def test_poses_written_while_tracking_was_lost_are_masked(tmp_path, walk):
-    stamps = formats.stamps_ns(walk.time)
-    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(walk, stamps))
-    rows = capture_rows(walk, 1, stamps[0], 1, 0.0)
+    rows = capture_rows(walk)
     for k in range(1000, 1300):
         rows[k] = ",".join(rows[k].split(",")[:2] + ["0.0"] * 6 + ["1.0"])
-    formats.save(tmp_path / "raw/vi1.csv", "", rows)
-    truth = read_recording(tmp_path / "raw/imu1.csv").truth
+    truth = read_recording(write_raw(tmp_path, apple_rows(walk), rows)).truth
     assert not truth.valid[1000:1300].any()
     assert truth.valid[:990].mean() > 0.95
     assert truth.valid[1310:].mean() > 0.95
 
 
 def test_swapped_neighbouring_rows_are_put_in_order(tmp_path, walk):
-    rows = apple_rows(walk, formats.stamps_ns(walk.time))
+    rows = apple_rows(walk)
     for k in range(100, 5000, 500):
         rows[k], rows[k + 1] = rows[k + 1], rows[k]
-    formats.save(tmp_path / "raw/imu1.csv", "", rows)
-    read = read_recording(tmp_path / "raw/imu1.csv")
+    read = read_recording(write_raw(tmp_path, rows, []))
     assert np.array_equal(read.gyro, walk.gyro)
     assert read.truth is None
 
 
 def test_large_scale_recordings_have_their_truth_in_a_neighbouring_folder(tmp_path, walk):
-    floor, start = tmp_path / "large scale/floor4", formats.stamps_ns(np.zeros(1))[0]
-    formats.save(floor / "imu/imu2.csv", "", apple_rows(walk, formats.stamps_ns(walk.time)))
-    formats.save(floor / "tango/tango2.csv", "", capture_rows(walk, 3, start, 10**6, 0.3))
+    floor = tmp_path / "large scale/floor4"
+    formats.save(floor / "imu/imu2.csv", "", apple_rows(walk))
+    formats.save(floor / "tango/tango2.csv", "", capture_rows(walk, 3, 10**6, 0.3))
     assert_matches(floor / "imu/imu2.csv", walk, 3.0)
     assert find_recordings(tmp_path) == [floor / "imu/imu2.csv"]
 
 
 def test_the_android_phones_rows_hold_one_sensor_each(tmp_path, walk):
-    raw = tmp_path / "multi devices/nexus 5/raw"
     stamps = [k // 1000 for k in formats.stamps_ns(walk.time, EPOCH_NS)]
     code = {1: walk.accel, 4: walk.gyro, 2: np.ones((len(walk), 3))}
     rows = [
@@ -190,41 +189,33 @@ def test_the_android_phones_rows_hold_one_sensor_each(tmp_path, walk):
         for sensor, values in code.items()
         for row in formats.text([stamps[k]], [sensor], values[k : k + 1])
     ]
-    formats.save(raw / "imu1.csv", "", rows)
-    formats.save(raw / "vi1.csv", "", capture_rows(walk, 1, EPOCH_NS, 1, 0.25))
-    assert_matches(raw / "imu1.csv", walk)
+    capture = capture_rows(walk, ahead=0.25, start=EPOCH_NS)
+    assert_matches(write_raw(tmp_path / "multi devices/nexus 5", rows, capture), walk)
 
 
 def test_a_capture_of_another_motion_is_rejected(tmp_path, walk, caplog):
-    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(walk, formats.stamps_ns(walk.time)))
     rng = np.random.default_rng(0)
     poses = np.hstack([rng.normal(size=(3000, 3)), Rotation.random(3000, rng=rng).as_quat()])
     stamps = formats.stamps_ns(np.arange(3000) / 100.0)
     rows = formats.text(stamps, list(range(3000)), poses)
-    formats.save(tmp_path / "raw/vi1.csv", "", rows)
-    with caplog.at_level(logging.WARNING):
-        assert read_recording(tmp_path / "raw/imu1.csv").truth is None
+    assert read_recording(write_raw(tmp_path, apple_rows(walk), rows)).truth is None
     assert "ground truth rejected" in caplog.text
 
 
 def test_times_rounded_too_coarsely_are_refused(tmp_path, walk):
-    stamps = formats.stamps_ns(walk.time)
-    formats.save(tmp_path / "raw/imu1.csv", "", apple_rows(walk, stamps))
-    rows = capture_rows(walk, 1, stamps[0], 1, 0.0)
-    rounded = [f"{float(row.split(',')[0]):.4e}," + row.split(",", 1)[1] for row in rows]
-    formats.save(tmp_path / "raw/vi1.csv", "", rounded)
+    cells = [row.split(",", 1) for row in capture_rows(walk)]
+    rounded = [f"{float(stamp):.4e},{others}" for stamp, others in cells]
     with pytest.raises(ReadError, match=r"vi1\.csv: time: found a step of 0"):
-        read_recording(tmp_path / "raw/imu1.csv")
+        read_recording(write_raw(tmp_path, apple_rows(walk), rounded))
 
 
 # --- recordings ------------------------------------------------------------------------------
 
 SELECTED = (
-    "handheld/data1/syn/imu2.csv",  # flips at 149 s
-    "multi users/user2/syn/imu6.csv",  # flips at 252 s
-    "trolley/data2/syn/imu1.csv",  # turns about the vertical only
+    OXIOD / "handheld/data1/syn/imu2.csv",  # flips at 149 s
+    OXIOD / "multi users/user2/syn/imu6.csv",  # flips at 252 s
+    OXIOD / "trolley/data2/syn/imu1.csv",  # turns about the vertical only
 )
-ALL = find_recordings(OXIOD) if OXIOD.is_dir() else []
 
 
 def assert_consistent(path: Path) -> None:
@@ -252,13 +243,13 @@ def assert_consistent(path: Path) -> None:
 
 
 @pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
-@pytest.mark.parametrize("name", SELECTED)
-def test_selected_recordings_are_self_consistent(name):
-    assert_consistent(OXIOD / name)
-
-
-@pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
-@pytest.mark.slow
-@pytest.mark.parametrize("path", ALL, ids=str)
-def test_every_recording_is_self_consistent(path):
+@pytest.mark.parametrize(
+    "path",
+    [
+        path if path in SELECTED else pytest.param(path, marks=pytest.mark.slow)
+        for path in (find_recordings(OXIOD) if OXIOD.is_dir() else SELECTED)
+    ],
+    ids=str,
+)
+def test_recordings_are_self_consistent(path):
     assert_consistent(path)
