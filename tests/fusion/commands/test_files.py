@@ -132,17 +132,6 @@ def test_a_simulated_house_has_floors_pressure_and_satellites(stario, tmp_path):
     assert pressure == pytest.approx(np.ptp(height), abs=2.0)
 
 
-def test_simulate_replaces_a_recording_only_on_request(stario, tmp_path):
-    own = tmp_path / "own.csv"
-    own.write_text("own")
-    refused = stario("simulate", "own.csv", "--seconds", 5)
-    assert refused.code == 1
-    assert "--overwrite" in refused.err
-    assert own.read_text() == "own"
-    assert stario("simulate", "own.csv", "--seconds", 5, "--overwrite").code == 0
-    assert len(read_generic_csv(own)) == 1001
-
-
 def test_export_accepts_the_name_of_a_network(stario, tmp_path, monkeypatch):
     """Of its run; without one, StarIO is the default and others require training first."""
     pytest.importorskip("onnx")
