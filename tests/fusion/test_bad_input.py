@@ -1,13 +1,14 @@
 """The navigator's handling of bad input, on simulated walks."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
-from support import CONFIG, GRAPH, Broken, ate, stream, stream_deviation
+from support import CONFIG, GRAPH, ate, broken, samples, stream, stream_deviation
 
 from stario.fusion import Navigator
 from stario.sequences.accuracy.metrics import align
@@ -47,20 +48,20 @@ def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
     assert all("\n" not in line for line in health.lines())
 
 
-@pytest.mark.parametrize(("factor", "start"), [(1e3, 0.0), (1e9, 1.7e18), (100.0, 0.0)])
-def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, factor, start):
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        (lambda time: 1e3 * time, "give times in s"),
+        (lambda time: 1.7e18 + 1e9 * time, "give times in s"),
+        (lambda time: 100.0 * time, "give times in s"),
+        (lambda time: (time + 1.7e9).astype(np.float32), "64 bits"),  # in which they repeat
+    ],
+)
+def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, change, remedy):
     navigator = Navigator(still_model, CONFIG)
-    mistimed = replace(walk, time=start + factor * walk.time)
-    with pytest.raises(InputError, match=r"time: found samples .* s apart.*give times in s"):
-        list(stream(navigator, mistimed))
+    with pytest.raises(InputError, match=f"time: found .*{remedy}"):
+        stream(navigator, replace(walk, time=change(walk.time)))
     assert navigator.state is None
-
-
-def test_times_since_1970_in_32_bits_are_refused(walk, still_model):
-    """They repeat for two minutes, in which nothing would tell why there is no state."""
-    coarse = replace(walk, time=(walk.time + 1.7e9).astype(np.float32))
-    with pytest.raises(InputError, match=r"1001 samples at 1700000000 s.*64 bits"):
-        list(stream(Navigator(still_model, CONFIG), coarse))
 
 
 @pytest.mark.parametrize(
@@ -72,7 +73,7 @@ def test_times_since_1970_in_32_bits_are_refused(walk, still_model):
     ],
 )
 def test_invalid_predictions_are_refused_and_counted(walk, make_oracle, mean, variance, reason):
-    model = Broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
+    model = broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
     track = Navigator(model, backend="ekf").run(walk)
     assert track.health.refused == {reason: track.health.updates // 3}
     assert ate(track, walk) < 0.3
@@ -88,7 +89,7 @@ def test_outliers_do_less_harm_than_without_a_gate(
     open_gate = replace(config, filter=replace(config.filter, gate=1.0 - 1e-16))
     gated, taken = (
         Navigator(
-            Broken(make_oracle(walk, walk.truth, each, sigma=sigma), metres, sigma**2),
+            broken(make_oracle(walk, walk.truth, each, sigma=sigma), metres, sigma**2),
             each,
             backend=backend,
         ).run(walk)
@@ -126,19 +127,18 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(make_walk, make_o
     assert np.max(speed_errors) < 0.25
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.9, 1.4])
-def test_a_recording_that_is_too_short_raises_a_clear_error(walk, still_model, seconds):
-    with pytest.raises(InputError, match="at least") as caught:
-        Navigator(still_model, backend="ekf").run(walk.slice(0.0, seconds))
-    assert walk.name in str(caught.value)
-
-
-def test_a_recording_of_pieces_shorter_than_a_window_raises_a_clear_error(
-    walk, still_model, without
-):
-    holed = without(walk, walk.time % 0.9 > 0.7)
-    with pytest.raises(InputError, match="unbroken stretch"):
-        Navigator(still_model, backend="ekf").run(holed)
+@pytest.mark.parametrize(
+    ("gone", "words"),
+    [
+        (lambda time: time > 0.0, "at least"),
+        (lambda time: time > 0.9, "at least"),
+        (lambda time: time > 1.4, "at least"),
+        (lambda time: time % 0.9 > 0.7, "unbroken stretch"),
+    ],
+)
+def test_a_recording_without_a_whole_window_is_refused(walk, still_model, without, gone, words):
+    with pytest.raises(InputError, match=f"{walk.name}.*{words}"):
+        Navigator(still_model, backend="ekf").run(without(walk, gone(walk.time)))
 
 
 @pytest.mark.parametrize(
@@ -168,42 +168,26 @@ def test_in_its_first_second_a_stream_has_a_health_report_but_no_state(walk, sti
     assert navigator.health.lines()
 
 
-# --- time ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("wild", "count"), [(1e9, 3), (2.0, 3)])
-def test_wild_timestamps_do_not_block_a_stream(walk, make_oracle, without, wild, count):
+@pytest.mark.parametrize(
+    ("rows", "wild"),
+    [
+        ([1000, 1050, 1100, 1300, 1301, 1302], 1e9),  # far ahead, several in a row as well
+        ([1000, 1050, 1100], 2.0),
+        ([0, 7], 1e9),
+        ([0, 7], 5.0),
+    ],
+)
+def test_wild_timestamps_do_not_block_a_stream(walk, make_oracle, without, rows, wild):
     walk = walk.slice(0.0, 15.0)
-    time = walk.time.copy()
-    jumped = np.zeros(len(walk), dtype=bool)
-    # Single samples or, if far ahead, several in a row as well.
-    jumped[1000 : 1000 + 50 * count : 50] = True
-    if wild > 100.0:
-        jumped[1300 : 1300 + count] = True
-    time[jumped] += wild
-    bad, expected = replace(walk, time=time), without(walk, jumped)
+    jumped = np.isin(np.arange(len(walk)), rows)
+    expected = without(walk, jumped)
     oracle = make_oracle(expected, walk.truth, CONFIG)
     navigator = Navigator(oracle)
-    states = stream(navigator, bad)
+    states = stream(navigator, replace(walk, time=walk.time + wild * jumped))
     assert stream_deviation(states, Navigator(oracle, backend="ekf").run(expected)) < 1e-9
-    assert navigator.health.samples["future"] == jumped.sum()
+    assert navigator.health.samples["future"] == len(rows)
     assert navigator.health.samples["out_of_order"] == 0
     assert navigator.health.gaps == []
-
-
-@pytest.mark.parametrize("first", [1e9, 5.0])
-def test_a_stream_may_start_with_a_wild_timestamp(walk, make_oracle, without, first):
-    walk = walk.slice(0.0, 5.0)
-    time = walk.time.copy()
-    time[0] = time[7] = first
-    gone = np.zeros(len(walk), dtype=bool)
-    gone[[0, 7]] = True
-    expected = without(walk, gone)
-    oracle = make_oracle(expected, walk.truth, CONFIG)
-    navigator = Navigator(oracle)
-    states = stream(navigator, replace(walk, time=time))
-    assert stream_deviation(states, Navigator(oracle, backend="ekf").run(expected)) < 1e-9
-    assert navigator.health.samples["future"] == 2
 
 
 def turned_over(walk: ImuSequence, late: np.ndarray) -> ImuSequence:
@@ -264,9 +248,6 @@ def test_a_device_turned_over_in_a_gap_does_not_run_away(walk, make_oracle, back
     assert np.nanmean(track.innovations.nis[track.innovations.time > 10.0]) < 6.0
 
 
-# --- values ----------------------------------------------------------------------------------
-
-
 def test_spikes_are_replaced_and_counted(walk, make_oracle):
     walk = walk.slice(0.0, 13.0)
     gyro, accel = walk.gyro.copy(), walk.accel.copy()
@@ -316,9 +297,6 @@ def test_a_dead_axis_is_logged_once_per_run(walk, still_model, caplog):
     assert caplog.text.count("its z axis never changes") == 1
 
 
-# --- a network that raises an error or predicts other shapes --------------------------------------
-
-
 class Failing:
     """Raises an error instead of some predictions."""
 
@@ -339,7 +317,7 @@ def test_a_stream_continues_after_its_network_has_failed(walk, make_oracle, back
     expected = {state.time: state.p_W for state in stream(Navigator(oracle, GRAPH), walk)}
     navigator = Navigator(Failing(oracle, {5, 6, 20}), GRAPH, backend=backend)
     states, failures = [], 0
-    for sample in zip(walk.time, walk.gyro, walk.accel, strict=True):
+    for sample in samples(walk):
         try:
             states.append(navigator.push(*sample))
         except RuntimeError:
@@ -355,21 +333,21 @@ def test_no_motion_is_lost_if_the_network_fails_within_a_hole(walk, make_oracle,
     config = replace(GRAPH, filter=replace(GRAPH.filter, update_rate=10))
     walk = walk.slice(0.0, 12.0)
     holed = without(walk, (walk.time > 10.055) & (walk.time < 10.205))
-    samples = list(zip(holed.time, holed.gyro, holed.accel, strict=True))
+    rows = list(samples(holed))
     oracle = make_oracle(holed, walk.truth, config)
     whole = Navigator(Failing(oracle, set()), config)
     calls = []
-    for sample in samples:
+    for row in rows:
         calls.append(whole.model.calls)
-        whole.push(*sample)
+        whole.push(*row)
     (k,) = np.flatnonzero(np.diff(calls) == 2)
     navigator = Navigator(Failing(oracle, {calls[k] + 1}), config)
-    for sample in samples[:k]:
-        navigator.push(*sample)
-    with pytest.raises(RuntimeError, match="out of memory"):
-        navigator.push(*samples[k])
-    for sample in samples[k + 1 :]:
-        navigator.push(*sample)
+    for row in rows[:k]:
+        navigator.push(*row)
+    with pytest.raises(RuntimeError, match="memory"):
+        navigator.push(*rows[k])
+    for row in rows[k + 1 :]:
+        navigator.push(*row)
     assert navigator.model.calls == whole.model.calls
     assert navigator.state.time == whole.state.time
     assert np.linalg.norm(navigator.state.p_W - whole.state.p_W) < 0.01
@@ -383,30 +361,27 @@ def variances(count: int) -> np.ndarray:
     return np.tile(0.01 * np.eye(3), (count, 1, 1))
 
 
+def custom(predict: Any) -> Any:
+    """A network of a function of the number of windows."""
+    return SimpleNamespace(predict=lambda windows: predict(len(windows)))
+
+
 @pytest.mark.parametrize(
     ("predict", "named"),
     [
         (lambda n: None, "NoneType"),
         (lambda n: zeros(n), "ndarray"),
-        (lambda n: (zeros(n), 0.01 * np.ones((n, 3))), r"covariances \(\d+, 3, 3\)"),
-        (lambda n: (zeros(n)[:, :2], variances(n)), r"displacements \(\d+, 3\)"),
-        (lambda n: (zeros(1), variances(1)), r"shapes \(1, 3\)"),  # would be every window's
+        (lambda n: (zeros(n), 0.01 * np.ones((n, 3))), "covariances"),
+        (lambda n: (zeros(n)[:, :2], variances(n)), "displacements"),
+        (lambda n: (zeros(1), variances(1)), "shapes"),  # would be every window's
         (lambda n: (zeros(n), variances(n) + np.triu(np.ones((3, 3)), 1)), "asymmetric"),
     ],
 )
 def test_predictions_of_other_shapes_are_refused(walk, predict, named):
-    class Custom:
-        def predict(self, windows):
-            return predict(len(windows))
-
     with pytest.raises(InputError, match=f"model.*{named}"):
-        Navigator(Custom(), backend="ekf").run(walk.slice(0.0, 4.0))
+        Navigator(custom(predict), backend="ekf").run(walk.slice(0.0, 4.0))
 
 
 def test_predictions_may_be_lists(walk):
-    class Custom:
-        def predict(self, windows):
-            return zeros(len(windows)).tolist(), variances(len(windows)).tolist()
-
-    track = Navigator(Custom(), backend="ekf").run(walk.slice(0.0, 4.0))
-    assert track.health.updates > 0
+    model = custom(lambda n: (zeros(n).tolist(), variances(n).tolist()))
+    assert Navigator(model, backend="ekf").run(walk.slice(0.0, 4.0)).health.updates > 0

@@ -5,10 +5,13 @@ import tracemalloc
 import zlib
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from support import stream
+from simulated import Still
+from support import samples, stream
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
 from stario.fusion.filter.alternative import AlternativeHypothesis
@@ -73,30 +76,23 @@ def test_a_snapshot_includes_the_prior(walk, make_oracle):
     assert_same(push(other, walk, 0.4, 5.0), push(whole, walk, 0.4, 5.0))
 
 
-# --- refused ---------------------------------------------------------------------------------
-
-
-class ModelWithCard:
-    def __init__(self, sha256: str) -> None:
-        self.card = type("Card", (), {"sha256": sha256})()
-
-    def predict(self, windows):
-        return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
+def model_with_card(sha256: str) -> Any:
+    return SimpleNamespace(predict=Still().predict, card=SimpleNamespace(sha256=sha256))
 
 
 def test_a_snapshot_of_another_configuration_or_model_is_refused_by_name(walk):
-    navigator = Navigator(ModelWithCard("abc"), CONFIG)
+    navigator = Navigator(model_with_card("abc"), CONFIG)
     push(navigator, walk, 0.0, 2.0)
-    data = navigator.snapshot()
     coarser = replace(CONFIG, filter=replace(CONFIG.filter, yaw_sigma=0.5))
-    with pytest.raises(InputError, match=r"config\.filter\.yaw_sigma: found 0\.001, expected 0\.5"):
-        Navigator(ModelWithCard("abc"), coarser).restore(data)
-    with pytest.raises(InputError, match="model: found 'abc'"):
-        Navigator(ModelWithCard("def"), CONFIG).restore(data)
-    other = Navigator(ModelWithCard("abc"), CONFIG, backend="graph")
-    with pytest.raises(InputError, match="backend"):
-        other.restore(data)
-    assert other.state is None
+    for sha256, config, backend, named in (
+        ("abc", coarser, "ekf", r"config\.filter\.yaw_sigma.*0\.001.*0\.5"),
+        ("def", CONFIG, "ekf", "model: found 'abc'"),
+        ("abc", CONFIG, "graph", "backend"),
+    ):
+        other = Navigator(model_with_card(sha256), config, backend=backend)
+        with pytest.raises(InputError, match=named):
+            other.restore(navigator.snapshot())
+        assert other.state is None
 
 
 def test_bytes_that_are_no_snapshot_are_refused(walk, still_model):
@@ -110,8 +106,8 @@ def test_bytes_that_are_no_snapshot_are_refused(walk, still_model):
     edited = data.replace(b"false", b"true ", 1), data.replace(b"<f8", b"<i8", 1)
     for bad, words in (
         *((part, "snapshot") for part in (b"", b"nonsense", data[:1000], data[:-30], flipped)),
-        *((part, r"snapshot: found edited.*begin a new stream") for part in edited),
-        (older, f"version: found 1, expected {VERSION}"),
+        *((part, "snapshot: found edited") for part in edited),
+        (older, f"version.*1.*{VERSION}"),
     ):
         assert bad != data
         with pytest.raises(InputError, match=words) as caught:
@@ -146,7 +142,7 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(walk, s
             navigator.update_position(time, zero, np.eye(3))
             navigator.update_velocity(time, zero, np.eye(3))
             navigator.update_yaw(time, 0.3, 0.5)
-        for row in zip(*(part[:400] for part in (walk.time, walk.gyro, walk.accel)), strict=True):
+        for row in samples(walk.select(slice(400))):
             navigator.push_magnetometer(row[0], np.array([20.0 + row[0], 5.0, -40.0]))
             navigator.push_pressure(row[0], 1000.0)
             navigator.push(*row)
@@ -174,7 +170,7 @@ def test_a_stream_is_silent_until_a_second_after_a_gap_and_a_snapshot_keeps_that
     resumed = Navigator(still_model, CONFIG, backend=backend)
     resumed.restore(data)
     push(expected, holed, 0.0, 6.0)
-    for row in zip(holed.time, holed.gyro, holed.accel, strict=True):
+    for row in samples(holed):
         if row[0] > 6.0:
             state, other = expected.push(*row), resumed.push(*row)
             if state is not None:
@@ -183,10 +179,6 @@ def test_a_stream_is_silent_until_a_second_after_a_gap_and_a_snapshot_keeps_that
     np.testing.assert_allclose(other.p_W, state.p_W, atol=1e-9)
 
 
-# --- memory ---------------------------------------------------------------------------------------
-
-
-BYTES_PER_NUMBER = 16
 RATE = 50.0
 
 
@@ -209,16 +201,20 @@ def memory_growth(navigator: Navigator, walk: ImuSequence, warm_up: float, secon
         tracemalloc.stop()
 
 
-def test_the_memory_of_a_stream_does_not_grow(make_walk, still_model):
-    growth = memory_growth(Navigator(still_model), make_walk(1, 12.0, RATE), 8.0, 12.0)
-    # One number per sample.
-    assert growth < BYTES_PER_NUMBER * RATE * 12.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_the_memory_of_an_hours_stream_does_not_grow(make_walk, still_model, backend):
+@pytest.mark.parametrize(
+    ("backend", "warm_up", "seconds", "numbers"),
+    [
+        ("ekf", 8.0, 12.0, RATE),  # one per sample
+        *(
+            pytest.param(backend, 120.0, 3600.0, 1.0, marks=pytest.mark.slow)  # and per 2 updates
+            for backend in ("ekf", "graph")
+        ),
+    ],
+)
+def test_the_memory_of_a_stream_does_not_grow(
+    make_walk, still_model, backend, warm_up, seconds, numbers
+):
+    """By that many numbers a second, of 16 bytes each."""
     navigator = Navigator(still_model, backend=backend)
-    growth = memory_growth(navigator, make_walk(1, 30.0, RATE), 120.0, 3600.0)
-    # Half of one number per network update.
-    assert growth < 0.5 * BYTES_PER_NUMBER * 2.0 * 3600.0
+    growth = memory_growth(navigator, make_walk(1, 12.0, RATE), warm_up, seconds)
+    assert growth < 16 * numbers * seconds

@@ -29,9 +29,6 @@ from stario.sequences.readers.tum import read_tum
 COMMANDS = "run live compare evaluate inspect convert train simulate export check"
 
 
-# --- help and usage ----------------------------------------------------------------------------
-
-
 def test_help_names_every_command():
     result = CliRunner().invoke(app, ["--help"])
     assert result.exit_code == 0
@@ -77,9 +74,6 @@ def test_a_bug_is_not_reported_as_an_error_of_the_user(stario, monkeypatch, reco
     monkeypatch.setattr("stario.sequences.readers.read_recording", broken)
     with pytest.raises(ZeroDivisionError):
         stario("run", recording)
-
-
-# --- run -------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -214,9 +208,6 @@ def test_run_accepts_a_folder_or_a_list_and_explains_figures_once(stario, record
     assert (tmp_path / "alone/track.tum").exists()
 
 
-# --- conventions -------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("command", ["run", "evaluate", "convert"])
 def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_path, command):
@@ -234,9 +225,6 @@ def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_pat
     assert done.code == 0, done.err
 
 
-# --- inspect -----------------------------------------------------------------------------------
-
-
 def test_inspect_names_the_option_that_helps(stario, recording, tmp_path, request):
     walk = read_generic_csv(recording)
     write_csv(tmp_path / "g.csv", replace(walk, accel=walk.accel / 9.80665))
@@ -249,9 +237,6 @@ def test_inspect_names_the_option_that_helps(stario, recording, tmp_path, reques
     assert all(each["code"] != "refused" for each in corrected["verdict"])
     assert corrected == json.loads((tmp_path / "runs/g/inspection.json").read_text())
     assert corrected["rate_hz"] == pytest.approx(100.0)
-
-
-# --- on the map ------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("no_figures")

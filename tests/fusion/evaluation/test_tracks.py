@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from recorded import DATA
 from scipy.interpolate import make_interp_spline
+from support import Counting
 
 from stario.fusion.evaluation.pedestrian import (
     WEINBERG_CONSTANT,
@@ -123,18 +123,6 @@ def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk):
     assert np.abs(recorded[1] - recorded[0]).max() < 0.02
     turn = tracks[1].trajectory.attitude_WB * tracks[0].trajectory.attitude_WB.inv()
     assert turn.magnitude().max() < 2e-3
-
-
-class Counting:
-    """A recurrent network that predicts how many windows of a stretch it has seen [m]."""
-
-    is_recurrent = True
-
-    def predict_next(self, windows: Any, updates: int, seen: int | None) -> Any:
-        first, n = seen or 0, len(windows)
-        mean = np.zeros((n, 3))
-        mean[:, 2] = first + np.arange(n)
-        return mean, np.tile(np.eye(3), (n, 1, 1)), first + n
 
 
 def test_the_memory_of_a_network_ends_at_a_gap(walk, without):

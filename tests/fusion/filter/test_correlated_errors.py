@@ -41,9 +41,6 @@ def config(correlated: bool) -> NavigatorConfig:
     return NavigatorConfig(filter=replace(F, correlated_errors=correlated))
 
 
-# --- the model -----------------------------------------------------------------------------------
-
-
 def test_shares_add_up_along_a_displacement_and_vanish_with_the_level():
     d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
     u = d_W[:2] / np.linalg.norm(d_W)
@@ -121,9 +118,6 @@ def test_a_network_that_claims_a_fifth_of_its_sigma_costs_little(make_walk, make
     (honest, _), (overconfident, nis) = found
     assert overconfident < honest + 0.2  # 0.5 if the gains believed it
     assert nis < 10.0  # 32 at a level of at most 5
-
-
-# --- the covariance ------------------------------------------------------------------------------
 
 
 def straight_walk(rng: np.random.Generator, seconds: int) -> tuple[Driven, np.ndarray, float]:
@@ -275,9 +269,6 @@ def test_no_measurement_estimates_them():
         update()
         np.testing.assert_allclose(np.diag(ekf.state.P_reported)[rows], 1.0, rtol=1e-9)
         assert not ekf.P[rows].any()
-
-
-# --- the graph's covariance ----------------------------------------------------------------------
 
 
 def random_covariance(rng: np.random.Generator) -> np.ndarray:

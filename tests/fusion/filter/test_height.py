@@ -101,9 +101,6 @@ def test_moving_the_map_changes_nothing_that_pressure_tells(transform):
     np.testing.assert_allclose(after.sigma, before.sigma, rtol=1e-5)
 
 
-# --- a house, with a network that knows only level floors ----------------------------------------
-
-
 @pytest.fixture(scope="module")
 def house():
     """A minute: stairs to the first floor, and a lift to the fourth."""

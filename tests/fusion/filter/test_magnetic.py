@@ -22,11 +22,9 @@ from stario.fusion.filter.magnetic import (
     update_bearing,
     with_field,
 )
-from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.fixes import position_fix
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.magnetometer import MagneticField
@@ -216,23 +214,6 @@ def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
 
 
-@pytest.mark.slow
-def test_a_streams_graph_estimates_the_same_bias_as_its_filter(biased_walk, make_oracle):
-    config = replace(CONFIG, filter=replace(CONFIG.filter, gyro_bias_sigma=1e-2))
-    walk = biased_walk.slice(0.0, 42.0)
-    oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
-    graph = stream(Navigator(oracle, config, backend="graph"), walk)[-1]
-    filtered, without_field = (
-        Navigator(oracle, config, backend="ekf").run(replace(walk, magnetometer=field))
-        for field in (walk.magnetometer, None)
-    )
-    ours = math.sqrt(graph.covariance[11, 11])
-    theirs, blind = (math.sqrt(t.covariance[-1, 11, 11]) for t in (filtered, without_field))
-    assert abs(graph.b_g[2] - filtered.b_g[-1, 2]) < 0.2 * theirs
-    assert ours == pytest.approx(theirs, rel=0.1)
-    assert blind > 1.1 * theirs
-
-
 @pytest.mark.parametrize("fault", ["axes swapped", "stopped"])
 def test_a_field_that_contradicts_the_gyroscope_does_not_turn_the_track(
     biased_walk, oracle, biased_track, fault
@@ -334,9 +315,3 @@ def test_north_is_not_applied_if_the_direction_is_known(biased_walk, make_oracle
     known = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3))
     track = Navigator(oracle, settings, prior=known, backend="ekf").run(walk)
     assert track.health.fixes == {}
-
-
-@pytest.mark.parametrize("declination", [4.0, math.nan, "east"])
-def test_a_declination_that_is_not_an_angle_is_refused(declination):
-    with pytest.raises(ConfigError, match="declination"):
-        FilterConfig(declination=declination)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulated import measured
 from support import GRAPH as CONFIG
-from support import stream
+from support import Altered, lying, stream
 
 from stario.fusion import Navigator, NavState, PriorPose
 from stario.fusion.evaluation.checks.fusion import true_fixes
@@ -112,22 +112,15 @@ def test_a_heading_alone_does_not_make_the_position_uncertain(make_walk, make_or
     assert track.covariance[0, 6:9, 6:9].trace() < 0.01
 
 
-class Climbing:
-    """A network that adds 0.4 m of height to every displacement."""
-
-    def __init__(self, inner: Any) -> None:
-        self.inner = inner
-
-    def predict(self, windows: Any) -> Any:
-        mean, covariance = self.inner.predict(windows)
-        return mean + np.array([0.0, 0.0, 0.4]), covariance
-
-
 @pytest.mark.slow
 def test_fixes_that_agree_prevail_over_an_overconfident_track(make_walk, make_oracle):
     """Otherwise it ends twenty metres too high, as each fix alone looks like an outlier."""
     walk = make_walk(3, 60.0, 50.0)
-    climbing = Climbing(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02))
+
+    def climb(number, mean, covariance):
+        mean[:, 2] += 0.4
+
+    climbing = Altered(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02), climb)
     fixes = fixes_of(walk, np.arange(3.0, 59.0, 2.0), np.zeros(3))
     track = Navigator(climbing, CONFIG, backend="ekf").run(walk, fixes=fixes)
     truth = walk.truth.at(np.clip(track.time, walk.time[0], walk.time[-1]))
@@ -188,13 +181,9 @@ def test_positions_undo_a_yaw_that_pointed_backwards():
 
 
 def test_more_accurate_positions_move_a_stationary_track(still_model):
-    time = np.arange(0.0, 20.0, 0.01)
-    still = ImuSequence(
-        "still", time, np.zeros((len(time), 3)), np.tile([0.0, 0.0, 9.81], (len(time), 1))
-    )
     fixes = [position_fix(3.0, [40.0, -30.0, 8.0], 2500.0 * np.eye(3))]
     fixes += [position_fix(t, np.zeros(3), np.eye(3)) for t in (5.0, 8.0, 11.0)]
-    track = Navigator(still_model, backend="ekf").run(still, fixes=fixes)
+    track = Navigator(still_model, backend="ekf").run(lying(20.0), fixes=fixes)
     assert np.linalg.norm(track.trajectory.position_W[-1]) < 1.0
     sigma = np.sqrt(np.diag(track.covariance[-1])[6:9])
     assert ((sigma > 0.5) & (sigma < 1.5)).all()
@@ -258,9 +247,6 @@ def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height():
     assert track.health.fixes == {"applied": 1, "yaw not known": 1}
 
 
-# --- the direction of a track from several positions together -------------------------------------
-
-
 def test_positions_too_close_to_give_a_direction_alone_give_it_together():
     walk, _, oracle = measured(13, 45.0, CONFIG, noise=0.02)
     farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
@@ -272,9 +258,6 @@ def test_positions_too_close_to_give_a_direction_alone_give_it_together():
     assert counts["applied"] > 5
     yaw = pose_errors(track.trajectory, walk.truth).yaw[-1]
     assert abs(yaw) < 3.0 * np.sqrt(track.covariance[-1, 2, 2])
-
-
-# --- the alignment -------------------------------------------------------------------------------
 
 
 def alignment_of(

@@ -191,9 +191,6 @@ def test_the_error_from_itself_is_zero_and_of_a_turned_state_is_the_turn():
     np.testing.assert_allclose(turned.error_from(state), expected, atol=1e-10)
 
 
-# --- marginal covariances -------------------------------------------------------------------------
-
-
 WIDTHS = (6, 3, 6, 1)
 
 

@@ -13,8 +13,6 @@ from stario.network import load_model
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
 
-# --- saturation ------------------------------------------------------------------------------
-
 
 def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
     """Number of samples flagged in a stream that is checked interval by interval."""
@@ -49,9 +47,6 @@ def test_a_clipped_sine_is_saturated_at_its_limit():
     assert stuck - 2 <= count_saturated(clipped) <= stuck
 
 
-# --- spikes ----------------------------------------------------------------------------------
-
-
 def test_a_spike_is_replaced_by_its_neighbours_mean_and_the_last_sample_by_the_one_before():
     rows = np.zeros((7, 7))
     rows[:, 0], rows[:, 1] = 0.01 * np.arange(7), np.arange(7.0)
@@ -81,9 +76,6 @@ def test_zeros_of_an_accelerometer_are_no_free_fall(make_walk, still_model):
     accel[250:260] = 0.0
     health = Navigator(still_model).run(replace(walk, accel=accel)).health
     assert health.samples["frozen"] == 10
-
-
-# --- a clock that is set back ----------------------------------------------------------------
 
 
 def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:

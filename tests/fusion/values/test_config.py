@@ -11,6 +11,7 @@ from stario.sequences.files import write_json
 from stario.sequences.noise import ImuNoise
 from stario.sequences.settings import with_settings
 
+NAN = float("nan")
 TOML = """
 gravity = 9.81
 [filter]
@@ -68,9 +69,8 @@ def test_a_saved_configuration_reads_back_equal(tmp_path):
         ({"filter": {"gate": 1.0}}, "filter.gate"),
         ({"filter": {"covariance_scale": 0.0}}, "filter.covariance_scale"),
         ({"filter": {"yaw_sigma": -1.0}}, "filter.yaw_sigma"),
-        ({"filter": {"declination": 4.0}}, "filter.declination"),
-        ({"graph": {"lag": 0.5}}, "graph.lag"),
-        ({"graph": {"lag": float("nan")}}, "graph.lag"),
+        *(({"filter": {"declination": value}}, "filter.declination") for value in (4.0, NAN, "E")),
+        *(({"graph": {"lag": value}}, "graph.lag") for value in (0.5, 100.0, NAN)),
         ({"noise": {"accel_noise": float("inf")}}, "noise.accel_noise"),
         ({"gravity": 0.98}, "gravity"),
     ],

@@ -92,9 +92,6 @@ def test_a_velocity_without_a_direction_is_none(speed, bearing):
     assert {fix.kind for fix in found.fixes} == {"position"}
 
 
-# --- tracks ----------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def walk(make_walk):
     """A walk whose receiver is wrong by the same 4 m, and gives velocities in its second half."""
