@@ -122,14 +122,20 @@ def off_by_a_metre(inner: Any, first: int, stop: int) -> Altered:
 
 
 class Counting:
-    """A recurrent network: one metre upwards per window in its memory, by series."""
+    """A recurrent network: a metre upwards per window in its memory, by default of each series."""
 
     is_recurrent = True
+
+    def __init__(self, series: int | None = None) -> None:
+        self.series = series
+
+    def predict(self, windows):
+        raise AssertionError("a network with memory must be called through `predict_next`")
 
     def predict_next(self, windows, updates, memory):
         first, n = memory or 0, len(windows)
         mean = np.zeros((n, 3))
-        mean[:, 2] = (first + np.arange(n)) // updates
+        mean[:, 2] = (first + np.arange(n)) // (self.series or updates)
         return mean, np.tile(np.eye(3), (n, 1, 1)), first + n
 
 

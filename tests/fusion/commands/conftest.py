@@ -66,13 +66,6 @@ def stario(monkeypatch, tmp_path, tmp_path_factory, capsys):
 
 
 @pytest.fixture
-def blank_figures(monkeypatch):
-    """Draw figures, but leave their files empty: rendering takes most of the time."""
-    saved = "stario.fusion.evaluation.results.save_figure"
-    monkeypatch.setattr(saved, lambda figure, path: path.touch())
-
-
-@pytest.fixture
 def no_figures(monkeypatch):
     """Skip figures, in tests that do not check them."""
     monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda found: {})

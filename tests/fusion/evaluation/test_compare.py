@@ -176,13 +176,6 @@ def test_a_folder_holds_what_was_measured(folder, compared, walk):
     assert (folder / "blind/plan.png").stat().st_size > 10_000
 
 
-@pytest.fixture
-def blank_figures(monkeypatch):
-    """Draw figures, but leave their files empty: most of the time goes into rendering."""
-    saved = "stario.fusion.evaluation.results.save_figure"
-    monkeypatch.setattr(saved, lambda figure, path: path.touch())
-
-
 @pytest.mark.usefixtures("blank_figures")
 def test_a_run_writes_its_files(tmp_path, compared, walk):
     track = compared.tracks["track"]
@@ -343,9 +336,3 @@ def test_a_removal_that_fails_is_named_and_can_be_repeated(tmp_path):
     (tmp_path / "network.npz").rmdir()
     write_results(tmp_path, {})
     assert not list(tmp_path.iterdir())
-
-
-def test_a_file_in_the_way_is_named(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(InputError, match="file"):
-        write_results(tmp_path / "file" / "out", files_of(1))

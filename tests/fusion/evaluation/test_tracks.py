@@ -128,7 +128,7 @@ def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk):
 def test_the_memory_of_a_network_ends_at_a_gap(walk, without):
     gaps = [(walk.time > 8.0) & (walk.time < stop) for stop in (8.0, 8.2, 10.0)]
     longest = [
-        network_track_true_attitude(Counting(), sequence, CONFIG).trajectory.velocity_W[:, 2].max()
+        network_track_true_attitude(Counting(1), sequence, CONFIG).trajectory.velocity_W[:, 2].max()
         for sequence in (without(walk, gone) for gone in gaps)
     ]
     assert longest == pytest.approx([190.0, 108.0, 90.0], abs=2.0)  # ten windows a second

@@ -51,8 +51,7 @@ WALK = st.lists(
 class FaultyNetwork:
     """A network whose predictions depend on the current fault."""
 
-    def __init__(self) -> None:
-        self.fault, self.size = "", 0.0
+    fault, size = "", 0.0
 
     def predict(self, windows):
         n = len(windows)

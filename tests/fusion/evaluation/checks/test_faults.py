@@ -15,7 +15,6 @@ from stario.fusion.evaluation.checks.faults import (
     with_true_displacements,
 )
 from stario.fusion.navigator import Navigator
-from stario.sequences.errors import InputError
 
 SECONDS = 10.0
 SAMPLES = ("time", "gyro", "accel")
@@ -88,12 +87,6 @@ def test_every_fault_is_reported(results, scores):
 def test_small_faults_add_little_error(results):
     for fault in ("one NaN in gyro", "20% of samples dropped", "190 Hz", "500 Hz"):
         assert results[fault].error_with < results[fault].error_without + 0.3
-
-
-def test_a_recording_without_truth_is_refused():
-    sequence, config = matched_walk(3.0)
-    with pytest.raises(InputError, match="truth"):
-        run_faults(sequence.without_truth(), config)
 
 
 def test_a_block_of_false_displacements_lasts_five_seconds():

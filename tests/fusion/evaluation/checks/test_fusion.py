@@ -6,9 +6,10 @@ from itertools import count
 import numpy as np
 import pandas as pd
 import pytest
-from support import CONFIG
+from support import CONFIG, lying
 
 from stario.fusion.evaluation.checks import fusion
+from stario.fusion.evaluation.checks.faults import run_faults
 from stario.fusion.evaluation.checks.fusion import (
     end_shift_table,
     end_shifts,
@@ -19,6 +20,7 @@ from stario.fusion.evaluation.checks.fusion import (
     track_with_fixes,
     true_fixes,
 )
+from stario.fusion.evaluation.checks.moments import moment_costs
 from stario.fusion.evaluation.scores import joined, scored, values
 from stario.fusion.navigator import Navigator
 from stario.fusion.values.config import NavigatorConfig
@@ -110,19 +112,24 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(walk, ma
     assert of(shorter, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[at_its_end, 2, 2]))
 
 
+@pytest.mark.parametrize(
+    "score",
+    [fusion_gain, track_with_fixes, moment_costs, lambda model, *rest: run_faults(*rest)],
+)
+def test_a_recording_without_truth_is_refused(walk, still_model, score):
+    with pytest.raises(InputError, match="truth"):
+        score(still_model, walk.without_truth(), CONFIG)
+
+
 def test_what_cannot_be_scored_is_refused(walk, still_model):
-    for score in (fusion_gain, track_with_fixes):
-        with pytest.raises(InputError, match="truth"):
-            score(still_model, walk.without_truth(), CONFIG)
     with pytest.raises(InputError, match="fixes"):
         track_with_fixes(still_model, walk, CONFIG, every=15.0)
     # A group's mean would be NaN with a single waypoint within the track.
     at_waypoints = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
-    with pytest.raises(InputError, match="fewer than 2 within the track"):
+    with pytest.raises(InputError, match="fewer than 2"):
         fusion_gain(still_model, replace(walk, truth=None, positions=at_waypoints), CONFIG)
-    force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
     with pytest.raises(InputError, match="metre"):
-        end_shifts(still_model, replace(walk, gyro=0.0 * force, accel=force, truth=None), CONFIG)
+        end_shifts(still_model, lying(20.0), CONFIG)
 
 
 def test_errors_and_sigmas_are_those_of_the_second_half(walk, still_model, monkeypatch):

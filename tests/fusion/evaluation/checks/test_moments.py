@@ -49,14 +49,6 @@ def test_the_table_counts_small_ratios_and_small_corrections():
     assert lines[3].split()[0] == "all"
 
 
-def test_a_fall_beyond_the_sensors_range_makes_no_correction_of_a_metre(monkeypatch):
-    monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["drop"],))
-    monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
-    walk = simulate_imu(generate_walk(2, 20.0), 200.0, ImuErrors(), 2)
-    found = moment_costs(load_model(), walk, NavigatorConfig())
-    assert (values(found, "step") < 1.0).all()
-
-
 def test_a_step_that_the_velocity_does_not_explain_is_a_correction(walk):
     time = np.arange(0.0, 5.0, 0.1)
     true = walk.truth.at(time)
@@ -90,18 +82,29 @@ def test_errors_are_those_of_each_part_and_of_both_as_one():
     assert np.isnan(moments._errors(truth[:2], estimate[:2], before[:2])[0])
 
 
-def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, monkeypatch):
-    monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["table"],))
-    monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
-    [found] = moment_costs(load_model(), walk, NavigatorConfig()).itertuples()
+@pytest.fixture
+def costs(monkeypatch):
+    """What the moment of a name costs in the middle of a recording."""
+
+    def of(name, recording):
+        monkeypatch.setattr(moments, "MOMENTS", (BY_NAME[name],))
+        monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
+        [found] = moment_costs(load_model(), recording, NavigatorConfig()).itertuples()
+        return found
+
+    return of
+
+
+def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, costs):
+    found = costs("table", walk)
     assert (found.group, found.track) == ("table, middle", "filtered")
     assert 0.0 < found.error_with < 2.0 * found.error_without
     assert 0.0 < found.step_without < moments.MAX_STEP
 
 
-def test_a_recording_without_known_positions_is_refused(walk):
-    with pytest.raises(InputError, match="truth"):
-        moment_costs(object(), walk.without_truth(), NavigatorConfig())
+def test_a_fall_beyond_the_sensors_range_makes_no_correction_of_a_metre(costs):
+    walk = simulate_imu(generate_walk(2, 20.0), 200.0, ImuErrors(), 2)
+    assert costs("drop", walk).step < 1.0
 
 
 MEASURED = {
