@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, NavState, PriorPose, Track
 from stario.sequences.accuracy.metrics import Alignment, evaluate_track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise

@@ -11,9 +11,7 @@ from scipy.spatial.transform import Rotation
 from support import CONFIG, GRAPH, ate, broken, samples, stream, stream_deviation
 
 from stario.fusion import Navigator
-from stario.sequences.accuracy.metrics import align
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError, align
 
 
 def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
@@ -24,14 +22,8 @@ def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
     oracle = make_oracle(bad, walk.truth, CONFIG)
     track = Navigator(oracle, backend="ekf").run(bad)
     health = track.health
-    assert health.samples == {
-        "used": len(walk) - 34,
-        "not_finite": 31,
-        "frozen": 0,
-        "duplicate": 1,
-        "out_of_order": 2,
-        "future": 0,
-    }
+    bad_samples = {"not_finite": 31, "frozen": 0, "duplicate": 1, "out_of_order": 2, "future": 0}
+    assert health.samples == {"used": len(walk) - 34, **bad_samples}
     ((start, length),) = health.gaps
     assert start == pytest.approx(time[199])
     assert length == pytest.approx(time[230] - time[199])
@@ -59,7 +51,7 @@ def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
 )
 def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, change, remedy):
     navigator = Navigator(still_model, CONFIG)
-    with pytest.raises(InputError, match=f"time: found .*{remedy}"):
+    with pytest.raises(InputError, match=f"^time.*{remedy}"):
         stream(navigator, replace(walk, time=change(walk.time)))
     assert navigator.state is None
 
@@ -83,18 +75,13 @@ def test_invalid_predictions_are_refused_and_counted(walk, make_oracle, mean, va
     ("backend", "config", "metres", "sigma"),
     [("ekf", CONFIG, 5.0, 0.02), ("graph", GRAPH, 2.0, 0.05)],
 )
-def test_outliers_do_less_harm_than_without_a_gate(
-    walk, make_oracle, backend, config, metres, sigma
-):
+def test_a_gate_makes_outliers_less_harmful(walk, make_oracle, backend, config, metres, sigma):
     open_gate = replace(config, filter=replace(config.filter, gate=1.0 - 1e-16))
-    gated, taken = (
-        Navigator(
-            broken(make_oracle(walk, walk.truth, each, sigma=sigma), metres, sigma**2),
-            each,
-            backend=backend,
-        ).run(walk)
-        for each in (config, open_gate)
-    )
+    tracks = []
+    for each in (config, open_gate):
+        model = broken(make_oracle(walk, walk.truth, each, sigma=sigma), metres, sigma**2)
+        tracks.append(Navigator(model, each, backend=backend).run(walk))
+    gated, taken = tracks
     assert 0.5 * gated.health.updates / 3 < gated.health.gated
     assert ate(gated, walk) < (0.5 if backend == "ekf" else 0.6) * ate(taken, walk)
 
@@ -114,14 +101,11 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(make_walk, make_o
         sigma = np.sqrt(np.trace(track.covariance[late, 6:9, 6:9], axis1=1, axis2=2))
         covered.append(np.linalg.norm(error[late], axis=1) / sigma)
         # The turn within the gap is unobservable: the speed recovers, the direction does not.
-        speed, true_speed = (
-            np.linalg.norm(v[late, :2], axis=1) for v in (aligned.velocity_W, truth.velocity_W)
-        )
+        velocities = (v[late, :2] for v in (aligned.velocity_W, truth.velocity_W))
+        speed, true_speed = (np.linalg.norm(v, axis=1) for v in velocities)
         speed_errors.append(np.abs(speed - true_speed).mean())
-        before, after = (
-            np.sqrt(np.trace(track.covariance[k, 6:9, 6:9]))
-            for k in (np.searchsorted(track.time, 8.0) - 1, -1)
-        )
+        rows = np.searchsorted(track.time, 8.0) - 1, -1
+        before, after = (np.sqrt(np.trace(track.covariance[k, 6:9, 6:9])) for k in rows)
         assert after > before
     assert np.max(np.mean(covered, axis=1)) < 2.0
     assert np.max(speed_errors) < 0.25
@@ -141,10 +125,7 @@ def test_a_recording_without_a_whole_window_is_refused(walk, still_model, withou
         Navigator(still_model, backend="ekf").run(without(walk, gone(walk.time)))
 
 
-@pytest.mark.parametrize(
-    "vector",
-    [3.0, "abc", (1, 2, None), pd.DataFrame([[0.0, 0.0, 9.8]])],
-)
+@pytest.mark.parametrize("vector", [3.0, "abc", (1, 2, None), pd.DataFrame([[0.0, 0.0, 9.8]])])
 def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model, vector):
     navigator = Navigator(still_model)
     with pytest.raises(InputError, match=r"^gyro: found "):
@@ -156,7 +137,7 @@ def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model, vector):
 
 @pytest.mark.parametrize("time", ["0.0", None, (1.0, 2.0), 10**400])
 def test_a_time_that_is_not_a_number_is_refused_by_name(still_model, time):
-    with pytest.raises(InputError, match=r"time: found .*, expected a number"):
+    with pytest.raises(InputError, match=r"^time.*a number"):
         Navigator(still_model).push(time, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
 
 
@@ -195,9 +176,8 @@ def turned_over(walk: ImuSequence, late: np.ndarray) -> ImuSequence:
     turn = Rotation.from_rotvec([1.5, 1.0, -0.5])
     gyro, accel = walk.gyro.copy(), walk.accel.copy()
     gyro[late], accel[late] = turn.apply(gyro[late]), turn.apply(accel[late])
-    attitude = [*walk.truth.attitude_WB[~late]] + [
-        R * turn.inv() for R in walk.truth.attitude_WB[late]
-    ]
+    before, after = (walk.truth.attitude_WB[rows] for rows in (~late, late))
+    attitude = [*before, *(after * turn.inv())]
     truth = replace(walk.truth, attitude_WB=Rotation.concatenate(attitude))
     return replace(walk, gyro=gyro, accel=accel, truth=truth)
 
@@ -210,10 +190,8 @@ def test_after_a_long_gap_the_navigator_restarts_where_it_was(walk, make_oracle)
     truth = replace(turned.truth, time=time)
     broken = replace(turned, time=time, truth=truth)
     oracle = make_oracle(broken, truth, CONFIG)
-    track, navigator = (
-        Navigator(oracle, CONFIG, backend="ekf").run(broken),
-        Navigator(oracle, CONFIG),
-    )
+    navigator = Navigator(oracle, CONFIG)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(broken)
     assert stream_deviation(stream(navigator, broken), track) < 1e-9
     assert track.health.gaps == [(pytest.approx(10.0), pytest.approx(seconds + 0.01, rel=1e-6))]
     after = track.time > 10.0 + seconds + 4.0
@@ -240,10 +218,8 @@ def test_a_device_turned_over_in_a_gap_does_not_run_away(walk, make_oracle, back
     truth = turned.truth.at(track.time[after])
     speed = np.linalg.norm(track.trajectory.velocity_W[after], axis=1)
     assert speed.max() < 2.0 + np.linalg.norm(truth.velocity_W, axis=1).max()
-    up, true_up = (
-        t.inv().apply([0.0, 0.0, 1.0])
-        for t in (track.trajectory.attitude_WB[after], truth.attitude_WB)
-    )
+    attitudes = track.trajectory.attitude_WB[after], truth.attitude_WB
+    up, true_up = (attitude.inv().apply([0.0, 0.0, 1.0]) for attitude in attitudes)
     assert np.degrees(np.linalg.norm(up - true_up, axis=1)).mean() < 4.0
     assert np.nanmean(track.innovations.nis[track.innovations.time > 10.0]) < 6.0
 
@@ -273,10 +249,8 @@ def test_a_clipped_sensor_is_flagged_and_trusted_less(walk, make_oracle):
     limit = float(np.quantile(np.abs(walk.accel).max(axis=1), 0.9))
     clipped = replace(walk, accel=np.clip(walk.accel, -limit, limit))
     stuck = (np.abs(clipped.accel[1:]) == limit) & (clipped.accel[1:] == clipped.accel[:-1])
-    graph, whole_graph = (
-        Navigator(make_oracle(each, walk.truth, CONFIG), CONFIG).run(each)
-        for each in (clipped, walk)
-    )
+    navigators = (Navigator(make_oracle(s, walk.truth, CONFIG), CONFIG) for s in (clipped, walk))
+    graph, whole_graph = (each.run(s) for each, s in zip(navigators, (clipped, walk), strict=True))
     for track, whole in ((graph, whole_graph), (graph.filtered, whole_graph.filtered)):
         assert 0.3 * stuck.sum() < track.health.flagged["saturated"] <= stuck.sum()
         assert whole.health.flagged == {"spike": 0, "saturated": 0}

@@ -1,6 +1,7 @@
 """A recording is smoothed as a whole, a stream by a window; both gain on the filter's states."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,7 @@ from support import WHITE as CONFIG
 from support import WHITE_ERRORS as ERRORS
 from support import nav_state, samples, stream
 
-from stario.fusion import Navigator, NavState, SmoothedPose
-from stario.fusion.values.fixes import position_fix
+from stario.fusion import Navigator, NavState, SmoothedPose, position_fix
 from stario.fusion.values.state import MAX_STEP, advanced
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -25,12 +25,9 @@ def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
 @pytest.fixture(scope="module")
 def walks(make_walk, make_oracle):
     """Walks, each with a model that measures its displacements with white noise."""
-    made = [make_walk(seed, 30.0, 50.0, ERRORS) for seed in range(5)]
-    noise = {"noise": 0.1, "sigma": 0.1}
-    return [
-        (walk, make_oracle(walk, walk.truth, CONFIG, seed=k, **noise))
-        for k, walk in enumerate(made)
-    ]
+    walks = [make_walk(seed, 30.0, 50.0, ERRORS) for seed in range(5)]
+    oracle = partial(make_oracle, config=CONFIG, noise=0.1, sigma=0.1)
+    return [(walk, oracle(walk, walk.truth, seed=k)) for k, walk in enumerate(walks)]
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +40,8 @@ def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(tra
     for walk, track in tracks:
         error = errors_at(track.trajectory, walk)[5:]
         smoothed.append(np.square(error).sum(axis=1).mean())
-        filtered.append(
-            np.square(errors_at(track.filtered.trajectory, walk)[5:]).sum(axis=1).mean()
-        )
+        theirs = errors_at(track.filtered.trajectory, walk)[5:]
+        filtered.append(np.square(theirs).sum(axis=1).mean())
         P = align(track.trajectory, walk.truth, "first").position_covariance_W[5:]
         nees.append(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]))
     assert np.mean(smoothed) < 0.95 * np.mean(filtered)
@@ -75,10 +71,8 @@ def steps(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.nd
 
 def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(tracks):
     for _, track in tracks:
-        smoothed, filtered = (
-            steps(each.time, each.position_W, each.velocity_W)
-            for each in (track.trajectory, track.filtered.trajectory)
-        )
+        both = track.trajectory, track.filtered.trajectory
+        smoothed, filtered = (steps(t.time, t.position_W, t.velocity_W) for t in both)
         assert smoothed.max() < 0.03
         assert filtered.max() > 0.05
 
@@ -126,9 +120,8 @@ def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states
         assert time[-1] == pytest.approx(track.time[-1] - 1.0)
         at = np.searchsorted(track.time, time - 1e-6)
         P = np.array([pose.covariance[3:, 3:] for pose in poses])
-        sigmas = [
-            np.trace(p, axis1=1, axis2=2) for p in (P, track.filtered.covariance[at, 6:9, 6:9])
-        ]
+        covariances = P, track.filtered.covariance[at, 6:9, 6:9]
+        sigmas = [np.trace(each, axis1=1, axis2=2) for each in covariances]
         # The gains do not know the network's scale error, which the covariances contain.
         assert (sigmas[0][2:] <= 1.05 * sigmas[1][2:]).all()
         assert np.median(sigmas[0] / sigmas[1]) < 0.99
@@ -142,9 +135,7 @@ def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states
     assert 1.4 < np.median(np.concatenate(nees)) < 3.4  # median of chi-square with 3 DoF: 2.4
 
 
-def test_a_smoothed_pose_of_unknown_direction_is_as_uncertain_as_the_newest_state(
-    make_walk, make_oracle
-):
+def test_a_smoothed_pose_is_as_uncertain_of_its_yaw_as_the_state(make_walk, make_oracle):
     """One position places the track and leaves its yaw in the map unknown."""
     walk = make_walk(1, 8.0, 100.0, ERRORS)
     fix = position_fix(3.0, walk.truth.at(np.array([3.0])).position_W[0], 1e-3 * np.eye(3))

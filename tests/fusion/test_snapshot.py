@@ -13,12 +13,10 @@ import pytest
 from simulated import Still
 from support import samples, stream
 
-from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, NavState, PriorPose
 from stario.fusion.filter.alternative import AlternativeHypothesis
 from stario.fusion.snapshot import VERSION, plain, unpack
-from stario.fusion.values.config import FilterConfig
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))
 
@@ -36,7 +34,7 @@ def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
 
 @pytest.mark.parametrize("stop", [0.5, 1.0, 7.37, 12.2, 14.41])
 def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, stop):
-    """Stopped in the first second, later, or next to a gap, with waiting and with late fixes."""
+    """Stopped in the first second, later, or next to a gap, with a prior, and with fixes."""
     holed = without(walk, (walk.time > 12.3) & (walk.time < 13.8))
     accel = holed.accel.copy()
     accel[300] += 400.0
@@ -48,7 +46,8 @@ def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, sto
             p = walk.truth.at(np.array([stop - 0.4])).position_W[0]
             navigator.update_position(stop - 0.4, p, 0.01 * np.eye(3))
 
-    whole, first, second = (Navigator(model, CONFIG) for _ in range(3))
+    prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
+    whole, first, second = (Navigator(model, CONFIG, p) for p in (prior, prior, None))
     for navigator in (whole, first):
         navigator.update_position(stop + 0.5, np.ones(3), np.eye(3))
         navigator.update_position(4.0, np.zeros(3), 0.01 * np.eye(3))
@@ -64,16 +63,6 @@ def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, sto
     assert_same(push(second, holed, stop, later), push(whole, holed, stop, later))
     assert second.health == whole.health
     assert second.health.fixes["value that is not finite"] == 1
-
-
-def test_a_snapshot_includes_the_prior(walk, make_oracle):
-    walk = walk.slice(0.0, 5.0)
-    model = make_oracle(walk, walk.truth, CONFIG)
-    prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
-    whole, other = Navigator(model, CONFIG, prior), Navigator(model, CONFIG)
-    push(whole, walk, 0.0, 0.4)
-    other.restore(whole.snapshot())
-    assert_same(push(other, walk, 0.4, 5.0), push(whole, walk, 0.4, 5.0))
 
 
 def model_with_card(sha256: str) -> Any:
@@ -147,10 +136,8 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(walk, s
             navigator.push_pressure(row[0], 1000.0)
             navigator.push(*row)
         visit(plain(unpack(navigator.snapshot()), {}))
-    rare = [
-        AlternativeHypothesis(navigator._stream.state.ekf, (0.0,)),
-        PriorPose(np.eye(3), zero, zero),
-    ]
+    rare = [AlternativeHypothesis(navigator._stream.state.ekf, (0.0,))]
+    rare += [PriorPose(np.eye(3), zero, zero)]
     visit(plain(rare, {}))
     names = {line.partition(":")[0] for line in found}
     assert names >= {"FieldState", "FrameTransform", "Fix", "Bearing", "Position", "Yaw"}
@@ -160,9 +147,7 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(walk, s
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_stream_is_silent_until_a_second_after_a_gap_and_a_snapshot_keeps_that_second(
-    walk, still_model, without, backend
-):
+def test_a_snapshot_keeps_the_silent_second_after_a_gap(walk, still_model, without, backend):
     holed = without(walk, (walk.time > 5.0) & (walk.time < 5.6))
     expected, resumed = (Navigator(still_model, CONFIG, backend=backend) for _ in range(2))
     push(resumed, holed, 0.0, 6.0)
@@ -211,9 +196,7 @@ def memory_growth(navigator: Navigator, walk: ImuSequence, warm_up: float, secon
         ),
     ],
 )
-def test_the_memory_of_a_stream_does_not_grow(
-    make_walk, still_model, backend, warm_up, seconds, numbers
-):
+def test_a_streams_memory_is_bounded(make_walk, still_model, backend, warm_up, seconds, numbers):
     """By that many numbers a second, of 16 bytes each."""
     navigator = Navigator(still_model, backend=backend)
     growth = memory_growth(navigator, make_walk(1, 12.0, RATE), warm_up, seconds)

@@ -7,8 +7,7 @@ import pytest
 from support import CONFIG, samples, stream, stream_deviation
 
 from stario.fusion import Navigator
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences import STANDARD_GRAVITY, ImuSequence, InputError
 
 
 def specific_force(walk: ImuSequence) -> np.ndarray:
@@ -72,13 +71,10 @@ def after_a_still_start(walk: ImuSequence) -> ImuSequence:
     rest = round(10.0 / step)
     noise = 0.01 * np.random.default_rng(0).standard_normal((rest, 6))
     up_B = specific_force(walk)[0]
-    return replace(
-        walk,
-        time=step * np.arange(rest + len(walk)),
-        gyro=np.vstack([noise[:, :3], walk.gyro]),
-        accel=np.vstack([up_B + noise[:, 3:], walk.accel]),
-        truth=None,
-    )
+    time = step * np.arange(rest + len(walk))
+    gyro = np.vstack([noise[:, :3], walk.gyro])
+    accel = np.vstack([up_B + noise[:, 3:], walk.accel])
+    return replace(walk, time=time, gyro=gyro, accel=accel, truth=None)
 
 
 def test_a_stream_in_degrees_is_refused_once_the_device_turns(make_walk, still_model):
@@ -97,7 +93,7 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(make_walk, st
     right = after_a_still_start(make_walk(1, 26.0)).slice(0.0, 20.0)
     dead = replace(right, **{sensor: np.tile(getattr(right, sensor)[0], (len(right), 1))})
     navigator = Navigator(still_model)
-    with pytest.raises(InputError, match=f"{sensor}: found values that never change"):
+    with pytest.raises(InputError, match=f"{sensor}.*never change"):
         stream(navigator, dead)
     assert navigator.state is None
     assert stream(navigator, right.slice(0.0, 3.0))
@@ -112,7 +108,7 @@ def starts_and_stops(gyro: np.ndarray) -> ImuSequence:
 
 
 def test_calm_in_between_does_not_hide_a_gyroscope_that_is_dead_from_the_beginning(still_model):
-    with pytest.raises(InputError, match="gyro: found values that never change"):
+    with pytest.raises(InputError, match=r"gyro.*never change"):
         stream(Navigator(still_model), starts_and_stops(np.zeros((4, 3))))
     live = np.outer([0.0, 0.001, 0.0, 0.002], [1.0, 1.0, 1.0])
     assert stream(Navigator(still_model), starts_and_stops(live))[-1].time > 47.0

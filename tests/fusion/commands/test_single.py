@@ -20,11 +20,9 @@ from stario.fusion.commands.cli import app
 from stario.fusion.commands.common import origin_of
 from stario.fusion.values.config import read_config
 from stario.network.model import load_model
-from stario.sequences.attitude.rotations import about_z
+from stario.sequences import about_z, read_tum, write_csv
 from stario.sequences.conventions import with_axes
-from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.readers.tum import read_tum
 
 COMMANDS = "run live compare evaluate inspect convert train simulate export check"
 
@@ -128,9 +126,7 @@ def true_fixes(recording, tmp_path):
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_a_track_with_fixes_is_aligned_by_least_squares_and_not_by_its_first_yaw(
-    stario, recording, tmp_path, true_fixes
-):
+def test_a_track_with_fixes_is_aligned_by_a_fit(stario, recording, tmp_path, true_fixes):
     fixes = true_fixes(yaw=1.0)
     done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
     assert json.loads(done.out)["track"]["ate_m"] < 0.3
@@ -215,9 +211,8 @@ def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_pat
     walk = with_axes(read_generic_csv(recording), "-y,x,z")
     upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", -90, degrees=True)
     linear = walk.accel - upright.apply([0.0, 0.0, 9.80665], inverse=True)
-    write_csv(
-        tmp_path / "odd.csv", replace(walk, gyro=np.degrees(walk.gyro), accel=linear / -9.80665)
-    )
+    odd = replace(walk, gyro=np.degrees(walk.gyro), accel=linear / -9.80665)
+    write_csv(tmp_path / "odd.csv", odd)
     target = ["out.csv"] if command == "convert" else []
     stario(command, "odd.csv", *target).assert_one_line_error()
     flags = ["--gyro-unit", "deg/s", "--accel-unit=-g", "--axes", "y,-x,z", "--gravity", "removed"]

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stario.sequences import PositionTrack, write_csv
 from stario.sequences.readers.archive import write_archive
-from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.sequence import PositionTrack
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -170,9 +169,7 @@ def test_a_declination_without_a_source_of_north_is_reported(stario, recording):
 
 
 @pytest.mark.parametrize(("command", "where"), [("train", "all.h5"), ("evaluate", "list.txt")])
-def test_a_missing_package_ends_a_batch_instead_of_leaving_out_recordings(
-    stario, recording, tmp_path, monkeypatch, command, where
-):
+def test_a_missing_package_ends_a_batch(stario, recording, tmp_path, monkeypatch, command, where):
     write_archive(tmp_path / "all.h5", [read_generic_csv(recording)])
     (tmp_path / "list.txt").write_text("all.h5:walk\n")
     monkeypatch.setitem(sys.modules, "h5py", None)

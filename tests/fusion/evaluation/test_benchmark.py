@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,6 @@ from stario.fusion.evaluation.displacement_error import (
 )
 from stario.fusion.evaluation.groups import (
     RATIOS,
-    Benchmark,
     alone_on,
     benchmark,
     groups_figure,
@@ -33,7 +32,6 @@ from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, 
 from stario.fusion.evaluation.scores import POOLED, values
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
@@ -42,9 +40,7 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 streams_of = cache(usable_streams)
 
 
-def with_known(
-    walk: ImuSequence, time: np.ndarray, kind: str = "positions", jump: float = 0.0
-) -> ImuSequence:
+def with_known(walk: ImuSequence, time: np.ndarray, kind="positions", jump=0.0) -> ImuSequence:
     """The walk with positions at these times instead of poses, which jump after 40 s."""
     position_W = walk.truth.at(time).position_W + np.where(time > 40.0, jump, 0.0)[:, None]
     known = position_W[:, :2] if kind == "waypoints" else position_W
@@ -55,19 +51,15 @@ def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
     return with_known(walk, np.arange(1.0, 70.0, every), "waypoints")
 
 
-def yaw_WN(walk: ImuSequence, stream: LevelledStream) -> np.ndarray:
-    """Yaw (K,) that rotates N to the true world at each tick."""
-    attitude_WB = walk.truth.at(stream.ticks).attitude_WB
-    return yaw_of(attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
-
-
 class Stub:
     """Predictor of the true displacements of successive windows, scaled and rotated."""
 
     def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
         [stream] = streams_of(walk)
         known = walk.truth.at(stream.ticks).position_W[:, :2] @ [1.0, 1j]
-        steps = np.exp(-1j * yaw_WN(walk, stream)[:-2]) * (known[2:] - known[:-2])
+        R_NB = Rotation.from_matrix(stream.R_NB)
+        attitude_WN = walk.truth.at(stream.ticks).attitude_WB * R_NB.inv()
+        steps = np.exp(-1j * yaw_of(attitude_WN)[:-2]) * (known[2:] - known[:-2])
         steps = scale * np.exp(1j * yaw) * steps[: stream.window_count]
         steps = np.pad(steps, (0, stream.window_count - len(steps)), "edge")
         steps = np.exp(-1j * stream.headings) * steps  # in the windows' frames
@@ -152,10 +144,9 @@ def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_jumps_and_g
         assert found["rms_10s_m"] == pytest.approx(smooth["rms_10s_m"], rel=rel)
         assert found["stretch_percent"] < 5.0
         assert np.isnan(found["ate_fit_m"])
-    whole, *fewer = (
-        blocks.groupby("metric")["count"].sum()["rms_10s_m"]
-        for blocks in (all_of_them, after_jump, after_gap)
-    )
+    all_blocks = all_of_them, after_jump, after_gap
+    counts = (blocks.groupby("metric")["count"].sum() for blocks in all_blocks)
+    whole, *fewer = (count["rms_10s_m"] for count in counts)
     assert max(fewer) < whole
     assert fewer[1] < whole - 2 * 15  # no window of 10 s in 15 s, two a second
 
@@ -211,27 +202,12 @@ def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(stepping):
     assert found["ate_fit_percent"] == pytest.approx(share, rel=0.1)
 
 
-Makers = dict[str, Callable[[str], Any]]
-"""By the name of the weights, a function that makes the network for a group."""
-
-
-def judged(
-    recordings: Mapping[str, ImuSequence],
-    models: Makers,
-    by: str = "set",
-    groups: Mapping[str, str] | None = None,
-) -> Benchmark:
-    paths = {Path(name): (groups or {}).get(name, "") for name in recordings}
-    found = [
-        alone_on(
-            recordings[str(path)],
-            path,
-            group,
-            lambda name, group: models[name](group),
-            models,
-        )
-        for path, group in paths.items()
-    ]
+def judged(recordings: Mapping[str, ImuSequence], models: dict[str, Any], by="set", groups=None):
+    """Compare networks that functions make for a group, by the name of the weights."""
+    found = []
+    for name, recording in recordings.items():
+        path, group = Path(name), (groups or {}).get(name, "")
+        found.append(alone_on(recording, path, group, lambda name, g: models[name](g), models))
     return benchmark(found, by, *models)
 
 
@@ -243,10 +219,7 @@ def of_person(recording: ImuSequence, person: str) -> ImuSequence:
 def pair(walk):
     recordings = {"one": of_person(walk, "a"), "two": of_person(with_waypoints(walk), "b")}
     scales = {"walks a": 0.95, "walks b": 0.9}
-    models = {
-        "ours": lambda group: Stub(walk, scales[group]),
-        "theirs": lambda group: Stub(walk, 0.8),
-    }
+    models = {"ours": lambda name: Stub(walk, scales[name]), "theirs": lambda _: Stub(walk, 0.8)}
     return judged(recordings, models, "person", {"one": "walks a", "two": "walks b"})
 
 
@@ -305,10 +278,7 @@ def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(walk)
     scales = {"r.h5:1": ("a", 0.95), "r.h5:2": ("b", 0.9), "r.h5:3": ("b", 0.9)}
     recordings = {name: of_person(walk, person) for name, (person, _) in scales.items()}
     by_group = {f"r {person}": scale for person, scale in scales.values()}
-    models = {
-        "ours": lambda group: Stub(walk, by_group[group]),
-        "theirs": lambda group: Stub(walk, 0.8),
-    }
+    models = {"ours": lambda name: Stub(walk, by_group[name]), "theirs": lambda _: Stub(walk, 0.8)}
     pooled = judged(recordings, models, "person").rows.iloc[-1]
     # Persons have equal weights.
     assert pooled["ratio_1s"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), rel=0.01)

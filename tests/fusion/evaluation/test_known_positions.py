@@ -22,9 +22,7 @@ from stario.fusion.evaluation.known_positions import (
     recording_verdict,
 )
 from stario.network import load_model
-from stario.sequences import Trajectory, read_recording
-from stario.sequences.findings import Finding
-from stario.sequences.sequence import PositionTrack
+from stario.sequences import Finding, PositionTrack, Trajectory, read_recording
 
 TIME = np.linspace(0.0, 20.0, 201)
 PATH = np.column_stack([TIME, np.sin(0.3 * TIME), 0.0 * TIME])
@@ -39,10 +37,13 @@ def waypoints(path, every=40, delay=0.0):
     return PositionTrack(TIME[::every] + delay, path[::every, :2], "waypoints")
 
 
-def test_a_rotated_and_translated_track_has_no_error():
-    rotated = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH)
-    rotated += np.array([7.0, -3.0, 1.0])
-    assert position_error(track(rotated), waypoints(PATH)) == (pytest.approx(0.0, abs=1e-9), 6)
+def test_a_rotated_and_translated_track_has_no_error_and_positions_are_placed_on_it():
+    rotated = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH) + np.array([7.0, -3.0, 1.0])
+    found = position_error(track(rotated), waypoints(PATH))
+    assert found == (pytest.approx(0.0, abs=1e-9), 6)
+    shown = placed(track(rotated), waypoints(PATH))
+    np.testing.assert_allclose(shown.position_W, rotated[::40, :2], atol=1e-9)
+    assert placed(track(PATH), waypoints(PATH, delay=100.0)) is None
 
 
 def test_a_track_ten_percent_too_long_has_a_tenth_of_its_spread_as_error():
@@ -52,9 +53,8 @@ def test_a_track_ten_percent_too_long_has_a_tenth_of_its_spread_as_error():
 
 
 def test_waypoints_outside_the_track_are_excluded():
-    few, all_of_them = (
-        position_error_words(track(PATH), waypoints(PATH, delay=delay)) for delay in (19.0, 0.0)
-    )
+    known = (waypoints(PATH, delay=delay) for delay in (19.0, 0.0))
+    few, all_of_them = (position_error_words(track(PATH), each) for each in known)
     assert few.startswith("1 of 6 waypoints")
     assert "too few" in few
     assert re.match(r"6 of 6 waypoints.* 0\.00 m rms", all_of_them)
@@ -65,13 +65,6 @@ def test_the_error_is_given_next_to_the_sigma_of_the_positions_used():
     known = PositionTrack(TIME[::40], PATH[::40, :2], "positions", valid, sigma)
     words = position_error_words(track(PATH), known)
     assert re.match(r"3 of 3 positions.* 0\.00 m rms.* sigma is 3 m", words)
-
-
-def test_placed_positions_are_fitted_to_the_track_in_the_frame_of_the_track():
-    rotated = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH) + np.array([7.0, -3.0, 1.0])
-    shown = placed(track(rotated), waypoints(PATH, delay=0.0))
-    np.testing.assert_allclose(shown.position_W, rotated[::40, :2], atol=1e-9)
-    assert placed(track(PATH), waypoints(PATH, delay=100.0)) is None
 
 
 @pytest.mark.parametrize(
@@ -157,9 +150,7 @@ def test_positions_contradict_by_length_and_handedness_alone(walk_and_track, cha
     path = change(walk.truth.at(time).position_W[:, :2])
     known = PositionTrack(time, path, "positions")
     found = position_findings(track, replace(walk, truth=None, positions=known))
-    assert [finding.code for finding in found if finding.code != "track_error"] == [code] * bool(
-        code
-    )
+    assert {finding.code for finding in found} - {"track_error"} == {code} - {""}
     few = replace(walk, truth=None, positions=known.slice(0.0, 1.2))
     assert position_findings(track, few) == []
 
@@ -171,9 +162,8 @@ def test_a_walk_taken_backwards_is_told_by_true_attitudes(walk_and_track, degree
     turned = Rotation.from_euler("z", degrees, degrees=True) * walk.truth.attitude_WB
     found = position_findings(track, replace(walk, truth=replace(walk.truth, attitude_WB=turned)))
     assert [finding.code for finding in found] == codes
-    assert [finding.values["turn_deg"] for finding in found] == pytest.approx(
-        [degrees] * len(codes), abs=5.0
-    )
+    turns = [finding.values["turn_deg"] for finding in found]
+    assert turns == pytest.approx([degrees] * len(codes), abs=5.0)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])

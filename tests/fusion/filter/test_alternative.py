@@ -11,21 +11,15 @@ from initial_ekf import Driven
 from support import nav_state, off_by_a_metre, stream
 from told import health_verdict
 
-from stario.fusion import Navigator
+from stario.fusion import FilterConfig, Health, Navigator, NavigatorConfig, WindowDisplacement
 from stario.fusion.evaluation.checks.faults import faults, matched_walk, run_faults
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.corrections import correction
 from stario.fusion.filter.displacements import Displaced, update_with
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.innovations import InnovationStatistics
-from stario.fusion.imu.inference import WindowDisplacement
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
-from stario.fusion.values.health import Health
 from stario.fusion.values.lie import about_vertical
-from stario.sequences.noise import ImuNoise
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import generate_walk
+from stario.sequences import PHONE_IMU, ImuNoise, ImuSequence, generate_walk, simulate_imu
 
 SECONDS = 120.0
 BLOCK, SINGLE = "network off by 1 m for 5 s", "5 % of windows off by 2 m"
@@ -86,9 +80,8 @@ def test_a_stream_forgets_false_displacements_too(make_walk, make_oracle, seed, 
 
 
 NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-4)
-CONFIG = NavigatorConfig(
-    NOISE, FilterConfig(covariance_scale=1.0, gyro_bias_sigma=3e-3, accel_bias_sigma=0.05)
-)
+FILTER = FilterConfig(covariance_scale=1.0, gyro_bias_sigma=3e-3, accel_bias_sigma=0.05)
+CONFIG = NavigatorConfig(NOISE, FILTER)
 
 
 def test_a_snapshot_includes_the_alternative(make_walk, make_oracle):

@@ -7,11 +7,10 @@ import pytest
 from initial_ekf import Driven
 from support import lying, nav_state
 
-from stario.fusion import Navigator, NavigatorConfig
+from stario.fusion import Navigator, NavigatorConfig, UpdateResult
 from stario.fusion.filter import estimator
 from stario.fusion.filter.gyro_bias import GyroBiasPrior, with_prior_replaced
 from stario.fusion.filter.innovations import InnovationStatistics
-from stario.fusion.filter.kalman import UpdateResult
 from stario.sequences import ImuSequence
 
 
@@ -133,9 +132,7 @@ def test_apparent_rest_that_lasts_long_is_rest(still_model):
         assert abs(yaw[-1] - yaw[0]) < 0.1
 
 
-def final_factor(
-    oracle: object, walk: ImuSequence, shake: float = 0.0, false: range = range(0)
-) -> float:
+def final_factor(oracle: object, walk: ImuSequence, shake=0.0, false=range(0)) -> float:
     """Factor with accelerometer errors `shake` [m/s^2] of 0.1 s each and `false` displacements."""
     config, rng = NavigatorConfig(), np.random.default_rng(3)
     preprocessed = Navigator(oracle, config).observe(walk)

@@ -8,14 +8,12 @@ from simulated import measured
 from support import GRAPH as CONFIG
 from support import Altered, lying, stream
 
-from stario.fusion import Navigator, NavState, PriorPose
+from stario.fusion import Fix, Navigator, NavState, PriorPose, position_fix, yaw_fix
 from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.planar_alignment import PlanarAlignment
-from stario.fusion.values.fixes import Fix, position_fix, yaw_fix
 from stario.fusion.values.lie import yaw_twist
+from stario.sequences import ImuSequence, about_z, yaw_of
 from stario.sequences.accuracy.metrics import pose_errors
-from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.sequence import ImuSequence
 
 BACKENDS = ("ekf", "graph")
 MAP = np.array([5.0e5, 4.5e6, 120.0])
@@ -29,10 +27,10 @@ def true_at(walk: ImuSequence, time: float) -> np.ndarray:
 def fixes_of(walk: ImuSequence, times: Any, shift: np.ndarray) -> list[Fix]:
     """Positions with a sigma of 0.3 m in a map frame that is turned and shifted."""
     rng, turn, covariance = np.random.default_rng(1), about_z(2.0), 0.09 * np.eye(3)
-    return [
-        position_fix(t, turn.apply(true_at(walk, t)) + rng.normal(0.0, 0.3, 3) + shift, covariance)
-        for t in times
-    ]
+    noise = (rng.normal(0.0, 0.3, 3) for _ in times)
+    off = zip(times, noise, strict=True)
+    places = (turn.apply(true_at(walk, t)) + error + shift for t, error in off)
+    return [position_fix(t, place, covariance) for t, place in zip(times, places, strict=True)]
 
 
 def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix]) -> list[NavState]:
@@ -53,9 +51,8 @@ def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(backend):
         assert np.linalg.eigvalsh(track.covariance[:, 6:9, 6:9]).min() > 0.0
         found.append((track, states[-1], shift))
     (near, last, _), (far, far_last, _) = found
-    np.testing.assert_allclose(
-        far.trajectory.position_W - MAP, near.trajectory.position_W, atol=1e-4
-    )
+    shifted = far.trajectory.position_W - MAP
+    np.testing.assert_allclose(shifted, near.trajectory.position_W, atol=1e-4)
     np.testing.assert_allclose(far.covariance[-1], near.covariance[-1], rtol=1e-3, atol=1e-9)
     np.testing.assert_allclose(far_last.p_W - MAP, last.p_W, atol=1e-4)
     np.testing.assert_allclose(far_last.covariance, last.covariance, rtol=1e-3, atol=1e-9)
@@ -214,10 +211,8 @@ def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(make_walk, wit
     broken = without(walk, (walk.time > 8.0) & (walk.time < 8.9))
     prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), np.zeros(3), walk.truth.position_W[0])
     useless = [position_fix(t, np.zeros(3), 1e6 * np.eye(3)) for t in np.arange(8.1, 8.9, 0.1)]
-    plain, cut = (
-        Navigator(still_model, prior=prior, backend="ekf").run(broken, fixes=f)
-        for f in ([], useless)
-    )
+    navigator = Navigator(still_model, prior=prior, backend="ekf")
+    plain, cut = (navigator.run(broken, fixes=fixes) for fixes in ([], useless))
     row = np.searchsorted(plain.time, 8.95)
     assert plain.covariance[row, 2, 2] > 0.2
     np.testing.assert_allclose(cut.covariance[row, 2, 2], plain.covariance[row, 2, 2], rtol=1e-3)
@@ -260,9 +255,7 @@ def test_positions_too_close_to_give_a_direction_alone_give_it_together():
     assert abs(yaw) < 3.0 * np.sqrt(track.covariance[-1, 2, 2])
 
 
-def alignment_of(
-    rng: np.random.Generator, turn: float, count: int, sigma: float
-) -> PlanarAlignment:
+def alignment_of(rng: np.random.Generator, turn, count, sigma) -> PlanarAlignment:
     """Alignment of a walk in a room, with independent noise in every fix."""
     z = rng.uniform(-2.0, 2.0, count) + 1j * rng.uniform(-2.0, 2.0, count)
     noise = rng.normal(0.0, sigma, count) + 1j * rng.normal(0.0, sigma, count)

@@ -8,34 +8,24 @@ import pytest
 from recorded import DATA
 from support import lying
 
-from stario.fusion import Navigator, PriorPose, Track
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, PriorPose, Track
 from stario.fusion.filter.zero_velocity import Stillness
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.network import load_model
-from stario.sequences import read_recording
+from stario.sequences import PHONE_IMU, ImuSequence, read_recording
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.imu import PHONE_IMU
 
 CONFIG = NavigatorConfig()
 NO_STILLNESS = replace(CONFIG, filter=replace(CONFIG.filter, stillness_noise=0.0))
 BIAS = np.array([2e-3, -1e-3, 1.5e-3])
 
 
-def on_table(
-    seconds: float, rate: float = 100.0, turn: float = 0.0, bias: np.ndarray = BIAS
-) -> ImuSequence:
+def on_table(seconds: float, rate=100.0, turn=0.0, bias=BIAS) -> ImuSequence:
     """A phone that lies on a table, or turns about the vertical at the rate `turn` [rad/s]."""
     noise, density = PHONE_IMU.noise, np.sqrt(rate)
     gyro = np.add(bias, [0.0, 0.0, turn])
     return lying(seconds, rate, gyro, density * noise.gyro_noise, density * noise.accel_noise)
-
-
-def fraction_at_rest(sequence: ImuSequence) -> float:
-    intervals, _ = cut_recording(sequence, CONFIG)
-    return float(np.mean(at_rest(intervals)))
 
 
 def at_rest(intervals: list[ImuInterval]) -> list[bool]:
@@ -48,7 +38,8 @@ def at_rest(intervals: list[ImuInterval]) -> list[bool]:
 
 @pytest.mark.parametrize("rate", [50.0, 1000.0])
 def test_a_device_on_a_table_is_at_rest_after_a_second(rate):
-    assert fraction_at_rest(on_table(5.0, rate)) == pytest.approx(41 / 50, abs=0.05)
+    intervals, _ = cut_recording(on_table(5.0, rate), CONFIG)
+    assert np.mean(at_rest(intervals)) == pytest.approx(41 / 50, abs=0.05)
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket", "trolley"])
@@ -129,9 +120,8 @@ def test_a_steady_glide_is_not_stopped(still_model):
 
 def test_a_slow_turn_is_not_mistaken_for_bias(still_model):
     """Unless it lasts for longer than anybody turns so evenly."""
-    track = Navigator(still_model, CONFIG, backend="ekf").run(
-        on_table(3.0, turn=0.05, bias=np.zeros(3))
-    )
+    turning = on_table(3.0, turn=0.05, bias=np.zeros(3))
+    track = Navigator(still_model, CONFIG, backend="ekf").run(turning)
     assert np.abs(track.b_g[-1]).max() < 0.01
 
 

@@ -9,8 +9,7 @@ from told import health_lines
 
 from stario.fusion import Navigator
 from stario.fusion.imu.faults import FrozenSensorDetector
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError
 
 
 @pytest.mark.parametrize("held", ["last", "zeros"])

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from support import Altered, Counting, stream
 
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig
 from stario.fusion.imu.direction import Direction, direction, weighted_force
 from stario.fusion.imu.inference import StatefulInference
-from stario.fusion.navigator import Navigator
 from stario.fusion.recording import cut_recording
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
-from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
-from stario.sequences.errors import InputError
+from stario.sequences import PERFECT_IMU, PHONE_IMU, InputError, generate_walk, simulate_imu
 from stario.sequences.levelled_stream import TICK_SAMPLES, TICKS_PER_SECOND, levelled_streams
-from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.windows import WINDOW_SAMPLES
 
 
@@ -27,9 +24,8 @@ def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, r
     config = NavigatorConfig(filter=FilterConfig(update_rate=rate))
     preprocessed = Navigator(Counting(), config).observe(with_gap(walk, without))
     stretches, all_counts = [[]], []
-    for interval, measurement in zip(
-        preprocessed.intervals, preprocessed.measurements, strict=True
-    ):
+    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    for interval, measurement in pairs:
         if interval.gap:
             stretches.append([])
         if measurement is not None:

@@ -14,7 +14,7 @@ from recorded import DATA
 from stario.fusion.evaluation.scores import joined, scored
 from stario.fusion.paper_table import sets, training
 from stario.fusion.paper_table.figures import pde_boxes
-from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, published
+from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets
 from stario.fusion.paper_table.table import COLUMNS, set_table, table_text, work_of
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
 from stario.network.runtime.survey import ModelRow
@@ -22,12 +22,9 @@ from stario.network.training import splits
 from stario.network.training.config import TrainingConfig
 from stario.network.training.history import EpochReport
 from stario.network.training.splits import learned_from
+from stario.sequences import InputError, PositionTrack, read_recording, write_csv
 from stario.sequences.datasets.splits import ListEntry
-from stario.sequences.errors import InputError
 from stario.sequences.files import write_json
-from stario.sequences.readers import read_recording
-from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.sequence import PositionTrack
 
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
@@ -84,9 +81,8 @@ def test_the_combined_set_is_tested_on_held_out_people_and_places():
     learned = [*together.training, *together.validation]
     assert not any("Thibaud" in str(path) or ":dan_" in str(path) for path in learned)
     assert not any("site2" in str(path) for path in learned)
-    assert {"tyrex", "ridi", "kipd", "ilc", "rocip", "oxiod"} <= set(
-        map(sets.set_of, together.test)
-    )
+    names = set(map(sets.set_of, together.test))
+    assert names >= {"tyrex", "ridi", "kipd", "ilc", "rocip", "oxiod"}
     tested = [one.group for one in together.test]
     assert tested.count("tyrex Thibaud") == 2  # of his 41
     known = learned_from(DATA)
@@ -98,9 +94,7 @@ TESTED = tuple(ListEntry(Path(f"ridi.h5:{name}"), "ridi") for name in "ab")
 DATASET = DataSet("own", (Path("ridi.h5:c"),), (Path("ridi.h5:d"),), TESTED, "")
 
 
-def content(
-    ate_m: float, network: str = "StarIO", seed: int = 0, seconds: float = 0.0
-) -> Mapping[str, Any]:
+def content(ate_m: float, network="StarIO", seed=0, seconds=0.0) -> Mapping[str, Any]:
     """Results on both recordings, the second without a drift."""
     labels = {"network": network, "seed": seed}
     names = [str(entry.path) for entry in TESTED]
@@ -155,13 +149,6 @@ def test_work_is_told_in_core_hours_and_windows_per_second():
     text = table_text([table], costs, work, TrainingConfig())
     assert "| StarIO | 2.762 (2.762) | 24.854 (25.122) | 11.2 | 1.00 | 0.50 | 5.00 | 200 |" in text
     assert "Total: 5.00 core hours, 4.00 for training and 1.00 for evaluation" in text
-
-
-def test_published_figures_are_found_by_set_and_network():
-    assert published("ridi", "StarIO") == (2.033, 2.274)
-    assert published("oxiod", "R-ResNet") == (4.336, 1.595)
-    assert published("ridi", "pdr") is None
-    assert published("tyrex", "StarIO") is None
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,7 @@ import pytest
 from stario.fusion.values.fix_file import check_within, read_fixes
 from stario.fusion.values.fixes import position_fix
 from stario.fusion.values.floors import FloorChange, floor_at, floor_changes
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError, ReadError
 
 HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 

@@ -11,8 +11,7 @@ from stario.fusion.imu.intervals import split_at
 from stario.fusion.recording import cut_recording
 from stario.fusion.values.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.values.lie import UNKNOWN_YAW
-from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, about_z, yaw_of
 
 EYE = np.eye(3)
 ROOT = np.array([[0.1, 0.1], [0.1, 0.3], [0.2, 0.7]])
@@ -158,10 +157,8 @@ def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk):
 def test_two_positions_determine_the_position_and_direction_of_a_track(walk, model, turn):
     """The map frame is turned and shifted relative to the walk's by any amount."""
     R, shift = about_z(turn).as_matrix(), np.array([5e3, -2e4, 30.0])
-    fixes = [
-        position_fix(t, R @ truth_at(walk, t)[0] + shift, 1e-4 * EYE)
-        for t in (4.0, 6.0, 28.0, 29.6)
-    ]
+    places = ((t, R @ truth_at(walk, t)[0] + shift) for t in (4.0, 6.0, 28.0, 29.6))
+    fixes = [position_fix(t, place, 1e-4 * EYE) for t, place in places]
     track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
     truth = walk.truth.at(track.time.clip(0.0, walk.time[-1]))
     error = track.trajectory.position_W - (truth.position_W @ R.T + shift)
@@ -222,13 +219,10 @@ def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(walk, mo
     prior = PriorPose(first.attitude_WB[0].as_matrix(), first.velocity_W[0], first.position_W[0])
     p = truth_at(walk, 25.0)[0]
     truth = walk.truth.position_W[-1]
-    for off, sigma, counts in (
-        (0.0, 1.0, {"applied": 1}),
-        (3.0, 0.01, {"applied": 1, "gated": 1}),
-    ):
+    for off, sigma, more in ((0.0, 1.0, {}), (3.0, 0.01, {"gated": 1})):
         fix = position_fix(25.0, [*p[:2], p[2] + off], sigma**2 * EYE)
         track = Navigator(model, CONFIG, prior, backend="ekf").run(walk, fixes=[fix])
-        assert track.health.fixes == counts
+        assert track.health.fixes == {"applied": 1} | more
         error = track.trajectory.position_W[-1] - truth
         assert np.linalg.norm(error) < 0.5 + 0.8 * off
 

@@ -41,9 +41,8 @@ def test_every_fault_but_none_modifies_samples_or_predictions_as_drawn_from_the_
     sequence, _ = matched_walk(5.0, seed=1)
     for fault in faults(5.0)[1:]:
         if fault.modify_samples is not None:
-            first, again = (
-                fault.modify_samples(sequence, np.random.default_rng(3)) for _ in range(2)
-            )
+            drawn = (np.random.default_rng(3) for _ in range(2))
+            first, again = (fault.modify_samples(sequence, rng) for rng in drawn)
             pairs = [[getattr(each, name) for each in (sequence, first, again)] for name in SAMPLES]
             assert not all(np.array_equal(old, new) for old, new, _ in pairs), fault.name
             for _, new, same in pairs:

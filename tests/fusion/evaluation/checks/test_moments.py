@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from stario.fusion import NavigatorConfig, Track
 from stario.fusion.evaluation.checks import moments
 from stario.fusion.evaluation.checks.moments import largest_correction, moment_costs, moment_table
 from stario.fusion.evaluation.checks.simulation import (
@@ -20,8 +21,6 @@ from stario.fusion.evaluation.checks.simulation import (
     simulated_walk,
 )
 from stario.fusion.evaluation.scores import joined, scored, values
-from stario.fusion.values.config import NavigatorConfig
-from stario.fusion.values.state import Track
 from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -54,17 +53,15 @@ def test_a_step_that_the_velocity_does_not_explain_is_a_correction(walk):
     true = walk.truth.at(time)
     late = time > 2.0
     velocity = np.gradient(true.position_W, time, axis=0)
-    moved = replace(
-        true, velocity_W=velocity, position_W=true.position_W + late[:, None] * [0.0, 3.0, 0.0]
-    )
+    position_W = true.position_W + late[:, None] * [0.0, 3.0, 0.0]
+    moved = replace(true, velocity_W=velocity, position_W=position_W)
     turned = replace(moved, attitude_WB=about_z(0.5 * late) * true.attitude_WB)
     zero = np.zeros((len(time), 3))
     step, turn = largest_correction(walk, Track(moved, b_g=zero))
     assert step == pytest.approx(3.0, abs=0.1)
     assert turn < 2.0  # errors of the gyroscope
-    assert largest_correction(walk, Track(turned, b_g=zero))[1] == pytest.approx(
-        np.degrees(0.5), abs=2.0
-    )
+    _, turn = largest_correction(walk, Track(turned, b_g=zero))
+    assert turn == pytest.approx(np.degrees(0.5), abs=2.0)
     in_gap = replace(turned, valid=time != time[late][0])
     step, turn = largest_correction(walk, Track(in_gap, b_g=zero))
     assert step < 0.1
