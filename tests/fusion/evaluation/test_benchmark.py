@@ -253,12 +253,23 @@ def test_a_device_at_rest_counts_in_no_median_or_ratio(walk, caplog, kind):
     resting = replace(walk, name="rest", truth=replace(walk.truth, position_W=still))
     if kind == "positions":
         resting = with_known(resting, walk.truth.time)
+
     models = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
     found, walking = judged({"walk": walk, "rest": resting}, models), judged({"walk": walk}, models)
     assert "rest: not compared" in caplog.text
     both, alone = (part.rows.iloc[-1] for part in (found, walking))
     assert str(both) == str(alone)  # some are NaN
     assert both["recordings"] == 1
+
+
+def test_stretches_at_rest_have_no_error_relative_to_their_path(walk):
+    """After half a minute the truth is but noise: errors would be half of its path."""
+    late, position_W = walk.truth.time > 30.0, walk.truth.position_W.copy()
+    noise = 1e-4 * np.random.default_rng(0).normal(size=(late.sum(), 3))
+    position_W[late] = position_W[late][0] + noise
+    halting = replace(walk, truth=replace(walk.truth, position_W=position_W))
+    found, _ = errors_of(with_known(halting, walk.truth.time), Stub(halting, 0.9))
+    assert 1.0 < found["stretch_percent"] < 5.0
 
 
 def test_rows_compare_weights_by_group_and_pooled(walk, pair):
