@@ -14,19 +14,33 @@ from stario.fusion import Navigator
 from stario.sequences import ImuSequence, InputError, align
 
 
-def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
+def with_bad_samples(walk: ImuSequence) -> tuple[ImuSequence, list[int]]:
+    """Return the walk with bad samples, and their rows: 33 are not finite, 3 come too late."""
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
-    gyro[200:230, 1], accel[700] = np.nan, np.inf
+    gyro[200:230, 1], gyro[400], accel[700], time[500] = np.nan, 1e300, np.inf, np.nan
     time[900], time[1100], time[1101] = time[899], time[1000], time[1000]
-    bad = replace(walk, time=time, gyro=gyro, accel=accel)
+    rows = [*range(200, 230), 400, 500, 700, 900, 1100, 1101]
+    return replace(walk, time=time, gyro=gyro, accel=accel), rows
+
+
+def test_bad_samples_do_not_affect_the_rest(walk, still_model, without):
+    bad, rows = with_bad_samples(walk)
+    good = without(walk, np.isin(np.arange(len(walk)), rows))
+    ours, theirs = (Navigator(still_model).run(each).arrays() for each in (bad, good))
+    for name, values in theirs.items():
+        np.testing.assert_allclose(ours[name], values, rtol=0.0, atol=1e-9, err_msg=name)
+
+
+def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
+    bad, rows = with_bad_samples(walk)
     oracle = make_oracle(bad, walk.truth, CONFIG)
     track = Navigator(oracle, backend="ekf").run(bad)
     health = track.health
-    bad_samples = {"not_finite": 31, "frozen": 0, "duplicate": 1, "out_of_order": 2, "future": 0}
-    assert health.samples == {"used": len(walk) - 34, **bad_samples}
+    bad_samples = {"not_finite": 33, "frozen": 0, "duplicate": 1, "out_of_order": 2, "future": 0}
+    assert health.samples == {"used": len(walk) - len(rows), **bad_samples}
     ((start, length),) = health.gaps
-    assert start == pytest.approx(time[199])
-    assert length == pytest.approx(time[230] - time[199])
+    assert start == pytest.approx(walk.time[199])
+    assert length == pytest.approx(walk.time[230] - walk.time[199])
     assert health.updates == len(track.innovations.time)
     assert health.refused == {}
     assert health.gated == int(track.innovations.gated.sum())

@@ -123,24 +123,6 @@ def test_windows_start_with_their_stated_attitude(walk):
     assert checked > 100
 
 
-def test_bad_samples_are_dropped_and_counted_and_do_not_affect_the_rest(walk, without):
-    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
-    gyro[300, 1], accel[500], time[700], gyro[900] = np.nan, np.inf, np.nan, 1e300
-    time[1000] = time[999]  # repeated
-    time[1200] = time[1201] = time[1150]  # late
-    bad = replace(walk, time=time, gyro=gyro, accel=accel)
-    gone = np.zeros(len(walk), dtype=bool)
-    gone[[300, 500, 700, 900, 1000, 1200, 1201]] = True
-    intervals, front_end = cut_recording(bad, CONFIG)
-    expected, _ = cut_recording(without(walk, gone), CONFIG)
-    dropped = {"not_finite": 4, "duplicate": 1, "out_of_order": 2}
-    assert counted(front_end) == {"used": len(walk) - 7, **dropped}
-    assert len(intervals) == len(expected)
-    for ours, theirs in zip(intervals, expected, strict=True):
-        np.testing.assert_allclose(ours.time, theirs.time, rtol=0.0, atol=1e-9)
-        np.testing.assert_allclose(ours.R_NB, theirs.R_NB, rtol=0.0, atol=1e-9)
-
-
 def samples_within(walk: ImuSequence, start: float, stop: float) -> np.ndarray:
     return (walk.time > start) & (walk.time < stop)
 
