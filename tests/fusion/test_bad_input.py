@@ -263,8 +263,11 @@ def test_a_clipped_sensor_is_flagged_and_trusted_less(walk, make_oracle):
     limit = float(np.quantile(np.abs(walk.accel).max(axis=1), 0.9))
     clipped = replace(walk, accel=np.clip(walk.accel, -limit, limit))
     stuck = (np.abs(clipped.accel[1:]) == limit) & (clipped.accel[1:] == clipped.accel[:-1])
-    navigators = (Navigator(make_oracle(s, walk.truth, CONFIG), CONFIG) for s in (clipped, walk))
-    graph, whole_graph = (each.run(s) for each, s in zip(navigators, (clipped, walk), strict=True))
+    tracks = []
+    for each in (clipped, walk):
+        oracle = make_oracle(each, walk.truth, CONFIG)
+        tracks.append(Navigator(oracle, CONFIG).run(each))
+    graph, whole_graph = tracks
     for track, whole in ((graph, whole_graph), (graph.filtered, whole_graph.filtered)):
         assert 0.3 * stuck.sum() < track.health.flagged["saturated"] <= stuck.sum()
         assert whole.health.flagged == {"spike": 0, "saturated": 0}

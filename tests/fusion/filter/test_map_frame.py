@@ -27,10 +27,11 @@ def true_at(walk: ImuSequence, time: float) -> np.ndarray:
 def fixes_of(walk: ImuSequence, times: Any, shift: np.ndarray) -> list[Fix]:
     """Positions with a sigma of 0.3 m in a map frame that is turned and shifted."""
     rng, turn, covariance = np.random.default_rng(1), about_z(2.0), 0.09 * np.eye(3)
-    noise = (rng.normal(0.0, 0.3, 3) for _ in times)
-    off = zip(times, noise, strict=True)
-    places = (turn.apply(true_at(walk, t)) + error + shift for t, error in off)
-    return [position_fix(t, place, covariance) for t, place in zip(times, places, strict=True)]
+    fixes = []
+    for t in times:
+        place = turn.apply(true_at(walk, t)) + rng.normal(0.0, 0.3, 3) + shift
+        fixes.append(position_fix(t, place, covariance))
+    return fixes
 
 
 def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix]) -> list[NavState]:

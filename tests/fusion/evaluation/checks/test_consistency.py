@@ -22,9 +22,8 @@ from stario.sequences.accuracy.nees import nees_bounds
 
 # Initial errors of metres per second and degrees of yaw interact beyond first order.
 CONFIG = NavigatorConfig(noise=ImuNoise(), filter=FilterConfig(velocity_sigma=0.1))
-TURN_ON = PHONE_IMU.gyro_turn_on, PHONE_IMU.accel_turn_on
-ERRORS = dict(zip(("gyro_bias_sigma", "accel_bias_sigma"), TURN_ON, strict=True))
-PHONE = NavigatorConfig(noise=PHONE_IMU.noise, filter=FilterConfig(velocity_sigma=0.1, **ERRORS))
+BIASES = {"gyro_bias_sigma": PHONE_IMU.gyro_turn_on, "accel_bias_sigma": PHONE_IMU.accel_turn_on}
+PHONE = NavigatorConfig(noise=PHONE_IMU.noise, filter=FilterConfig(velocity_sigma=0.1, **BIASES))
 
 
 def averages(config: NavigatorConfig, runs: int = 20, seconds: float = 300.0) -> SimpleNamespace:
