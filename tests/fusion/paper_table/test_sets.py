@@ -14,7 +14,7 @@ from recorded import DATA
 from stario.fusion.evaluation.scores import joined, scored
 from stario.fusion.paper_table import sets, training
 from stario.fusion.paper_table.figures import pde_boxes
-from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets
+from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, folder_set
 from stario.fusion.paper_table.table import COLUMNS, set_table, table_text, work_of
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
 from stario.network.runtime.survey import ModelRow
@@ -22,21 +22,28 @@ from stario.network.training import splits
 from stario.network.training.config import TrainingConfig
 from stario.network.training.history import EpochReport
 from stario.network.training.splits import learned_from
-from stario.sequences import InputError, PositionTrack, read_recording, write_csv
+from stario.sequences import ImuSequence, InputError, PositionTrack, read_recording, write_csv
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.files import write_json
+from stario.sequences.readers.archive import write_archive
 
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
 
-def test_a_split_is_disjoint_complete_and_determined_by_the_seed():
-    recordings = [ListEntry(Path(f"a.h5:{k:02d}"), "a") for k in range(40)]
-    first, again, other = (sets._split("a", recordings, seed) for seed in (3, 3, 4))
+def archived(path: Path, names: Iterable[str]) -> None:
+    """Write an archive of recordings of two samples."""
+    time, zero = np.arange(2) / 100.0, np.zeros((2, 3))
+    write_archive(path, [ImuSequence(name, time, zero, zero) for name in names])
+
+
+def test_a_split_is_disjoint_complete_and_determined_by_the_seed(tmp_path):
+    archived(tmp_path / "a.h5", map(str, range(40)))
+    first, again, other = (folder_set("a", tmp_path, seed) for seed in (3, 3, 4))
     assert first == again
     assert first.test != other.test
     parts = [set(first.training), set(first.validation), {one.path for one in first.test}]
     assert [len(part) for part in parts] == [32, 4, 4]
-    assert set.union(*parts) == {one.path for one in recordings}
+    assert len(set.union(*parts)) == 40
     assert "seed 3" in first.words
 
 
@@ -47,13 +54,14 @@ def walks_of(part: Iterable[Path]) -> list[str]:
     return [path.name.removesuffix("S9").removesuffix("S20") for path in part]
 
 
-def test_two_phones_on_one_walk_are_in_the_same_part(monkeypatch):
+def test_two_phones_on_one_walk_are_in_the_same_part(monkeypatch, tmp_path):
+    archived(tmp_path / "kipd.h5", (entry.path.name.partition(":")[2] for entry in PHONES))
     held = [ListEntry(Path("ridi.h5:dan"), "ridi dan")]
     parts = {"all": [*PHONES, *held], "test": [], "holdout": held}
     for module in (sets, splits):
         monkeypatch.setattr(module, "read_packaged_list", lambda name, data: parts[name])
     for seed in range(5):
-        split = sets._split("kipd", PHONES, seed)
+        split = folder_set("kipd", tmp_path, seed)
         for part in (split.training, split.validation, [one.path for one in split.test]):
             assert set(Counter(walks_of(part)).values()) == {2}
         [together] = development_sets(Path(), seed, 2, [ALL])
