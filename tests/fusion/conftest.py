@@ -54,3 +54,10 @@ def narrow_network(monkeypatch):
     from training_runs import narrow  # which imports torch, for seconds
 
     narrow(monkeypatch)
+
+
+@pytest.fixture
+def blank_figures(monkeypatch):
+    """Draw figures, but leave their files empty: rendering takes most of the time."""
+    saved = "stario.fusion.evaluation.results.save_figure"
+    monkeypatch.setattr(saved, lambda figure, path: path.touch())

@@ -6,14 +6,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from support import nav_state
 
 from stario.fusion.filter import ekf, kalman
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.values.state import NavState, changed
 from stario.sequences.attitude.so3 import exp_so3
 
-ZERO = np.zeros(3)
-NOTHING = NavState(math.nan, np.eye(3), ZERO, ZERO, ZERO, ZERO, np.zeros((15, 15)))
+NOTHING = nav_state(np.zeros((15, 15)), math.nan)
 
 
 class Driven:
@@ -61,13 +61,8 @@ class Driven:
 def initialised(slots: int) -> Driven:
     """A filter with a tilted, turned and moving initial state."""
     sigma = np.repeat([0.05, 0.3, 0.1, 0.003, 0.05], 3)
-    state = NavState(
-        10.0,
-        exp_so3(np.array([0.5, -0.7, 2.0])),
-        np.array([1.0, -0.5, 0.1]),
-        np.array([30.0, -20.0, 1.0]),
-        np.array([0.001, 0.002, -0.001]),
-        np.array([0.02, -0.01, 0.03]),
-        np.diag(sigma**2),
-    )
+    R_WB = exp_so3(np.array([0.5, -0.7, 2.0]))
+    v_W, p_W = np.array([[1.0, -0.5, 0.1], [30.0, -20.0, 1.0]])
+    b_g, b_a = np.array([[0.001, 0.002, -0.001], [0.02, -0.01, 0.03]])
+    state = nav_state(np.diag(sigma**2), 10.0, R_WB=R_WB, v_W=v_W, p_W=p_W, b_g=b_g, b_a=b_a)
     return Driven(slots, state)

@@ -2,7 +2,7 @@
 
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,22 +16,6 @@ from stario.sequences.sequence import BoolArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS, rotated_windows
-
-
-class Windows(NamedTuple):
-    """The windows of a recording, as a network receives them.
-
-    Attributes:
-        stop: (n,) their ends [s].
-        R_NB: (n,) levelled attitudes at their starts.
-        heading: (n,) headings of the device in N [rad].
-        contents: their samples in axes without that heading, as bytes.
-    """
-
-    stop: np.ndarray
-    R_NB: Rotation
-    heading: np.ndarray
-    contents: list[bytes]
 
 
 @lru_cache(maxsize=24)
@@ -50,13 +34,17 @@ def cut_once(sequence: ImuSequence, config: NavigatorConfig) -> tuple[list[ImuIn
 
 
 @lru_cache(maxsize=16)
-def windows_of(sequence: ImuSequence, config: NavigatorConfig) -> Windows:
-    """Windows into which a navigator cuts a recording; many tests share a few recordings."""
+def windows_of(sequence: ImuSequence, config: NavigatorConfig) -> SimpleNamespace:
+    """Windows into which a navigator cuts a recording, as a network receives them.
+
+    Ends [s], levelled attitudes at the starts, headings of the device in N [rad], and samples in
+    axes without that heading, as bytes.
+    """
     intervals, _ = cut_once(sequence, config)
     complete = [e for e in intervals if e.window is not None]
     heading = np.array([e.window.heading for e in complete])
     windows = rotated_windows(np.stack([e.window.imu_N for e in complete]), -heading)
-    return Windows(
+    return SimpleNamespace(
         stop=np.array([e.stop for e in complete]),
         R_NB=Rotation.from_matrix(np.stack([e.window.R_NB for e in complete])),
         heading=heading,
@@ -110,9 +98,7 @@ NOISY = ImuErrors(gyro_turn_on=3e-3, accel_turn_on=0.03)
 
 
 @lru_cache(maxsize=64)
-def simulated_walk(
-    seed: int = 1, seconds: float = 20.0, rate: float = 100.0, errors: ImuErrors = NOISY, **style
-) -> ImuSequence:
+def simulated_walk(seed=1, seconds=20.0, rate=100.0, errors=NOISY, **style) -> ImuSequence:
     style = {"carry": "handheld", "mount_rotvec": (0.4, -0.7, 1.1), **style}
     walk = generate_walk(seed, seconds, style=WalkStyle(**style))
     return simulate_imu(walk, rate, errors, seed, name=f"walk-{seed}")

@@ -1,16 +1,17 @@
 """Settings, error metrics and a faulty network, shared by tests of the navigator."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, NavState, PriorPose, Track
 from stario.sequences.accuracy.metrics import Alignment, evaluate_track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import ImuErrors
 
 # Settings for the oracle and the simulated phone; the defaults are for networks and real phones.
@@ -31,15 +32,41 @@ WHITE_ERRORS = ImuErrors(noise=WHITE_NOISE, gyro_turn_on=3e-3, accel_turn_on=0.0
 WHITE = NavigatorConfig(WHITE_NOISE, replace(FILTER, update_rate=1))
 
 
+def samples(sequence: ImuSequence) -> Iterator[tuple[float, Any, Any]]:
+    """Return the IMU's samples as they are pushed."""
+    return zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
+
+
 def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
     """States of a stream of the IMU's samples and, at their times, of the magnetometer's."""
     states, fields = [], sequence.magnetometer
     waiting = list(zip(fields.time.tolist(), fields.field, strict=True)) if fields else []
-    for row in zip(sequence.time, sequence.gyro, sequence.accel, strict=True):
+    for row in samples(sequence):
         while waiting and waiting[0][0] <= row[0]:
             navigator.push_magnetometer(*waiting.pop(0))
         states.append(navigator.push(*row))
     return [state for state in states if state is not None]
+
+
+def nav_state(covariance: np.ndarray, time: float = 0.0, **parts: Any) -> NavState:
+    """A level state at the origin and at rest, but for the given parts."""
+    zero = np.zeros(3)
+    state = NavState(time, np.eye(3), zero, zero, zero, zero, covariance)
+    return replace(state, **parts)
+
+
+def lying(
+    seconds: float,
+    rate: float = 100.0,
+    gyro: ArrayLike = (0.0, 0.0, 0.0),
+    gyro_noise: float = 0.0,
+    accel_noise: float = 0.0,
+) -> ImuSequence:
+    """A phone on a table whose gyroscope shows a rate, with noise of its samples."""
+    rng, count = np.random.default_rng(0), round(seconds * rate) + 1
+    noise = rng.standard_normal((2, count, 3))
+    force = np.array([0.0, 0.0, STANDARD_GRAVITY]) + accel_noise * noise[1]
+    return ImuSequence("lying", np.arange(count) / rate, gyro + gyro_noise * noise[0], force)
 
 
 def true_start(walk: ImuSequence) -> PriorPose:
@@ -60,20 +87,55 @@ def ate(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> 
     return evaluate_track(track.trajectory, sequence.truth, alignment=alignment).ate_m
 
 
-class Broken:
-    """Adds an error in x to every third prediction and replaces its variance."""
+class Altered:
+    """A network whose predictions a function changes in place, given their numbers."""
 
-    def __init__(self, inner: Any, mean: float, variance: float) -> None:
-        self.inner, self.mean, self.variance, self.count = inner, mean, variance, 0
+    def __init__(self, inner: Any, change: Callable[..., object]) -> None:
+        self.inner, self.change, self.count = inner, change, 0
 
     def predict(self, windows):
         mean, covariance = self.inner.predict(windows)
-        for k in range(len(mean)):
-            self.count += 1
-            if self.count % 3 == 0:
-                mean[k, 0] += self.mean
-                covariance[k, 0, 0] = self.variance
+        self.change(np.arange(self.count, self.count + len(mean)), mean, covariance)
+        self.count += len(mean)
         return mean, covariance
+
+
+def broken(inner: Any, mean: float, variance: float) -> Altered:
+    """Adds an error in x to every third prediction and replaces its variance."""
+
+    def change(number, means, covariances):
+        third = number % 3 == 2
+        means[third, 0] += mean
+        covariances[third, 0, 0] = variance
+
+    return Altered(inner, change)
+
+
+def off_by_a_metre(inner: Any, first: int, stop: int) -> Altered:
+    """Adds a metre in x to the predictions number `first` to `stop` - 1."""
+
+    def change(number, means, covariances):
+        means[(number >= first) & (number < stop), 0] += 1.0
+
+    return Altered(inner, change)
+
+
+class Counting:
+    """A recurrent network: a metre upwards per window in its memory, by default of each series."""
+
+    is_recurrent = True
+
+    def __init__(self, series: int | None = None) -> None:
+        self.series = series
+
+    def predict(self, windows):
+        raise AssertionError("a network with memory must be called through `predict_next`")
+
+    def predict_next(self, windows, updates, memory):
+        first, n = memory or 0, len(windows)
+        mean = np.zeros((n, 3))
+        mean[:, 2] = (first + np.arange(n)) // (self.series or updates)
+        return mean, np.tile(np.eye(3), (n, 1, 1)), first + n
 
 
 def swivelled(walk: ImuSequence, rate: float) -> ImuSequence:

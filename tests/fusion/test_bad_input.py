@@ -1,39 +1,46 @@
 """The navigator's handling of bad input, on simulated walks."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
-from support import CONFIG, GRAPH, Broken, ate, stream, stream_deviation
+from support import CONFIG, GRAPH, ate, broken, samples, stream, stream_deviation
 
 from stario.fusion import Navigator
-from stario.sequences.accuracy.metrics import align
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError, align
+
+
+def with_bad_samples(walk: ImuSequence) -> tuple[ImuSequence, list[int]]:
+    """Return the walk with bad samples, and their rows: 33 are not finite, 3 come too late."""
+    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
+    gyro[200:230, 1], gyro[400], accel[700], time[500] = np.nan, 1e300, np.inf, np.nan
+    time[900], time[1100], time[1101] = time[899], time[1000], time[1000]
+    rows = [*range(200, 230), 400, 500, 700, 900, 1100, 1101]
+    return replace(walk, time=time, gyro=gyro, accel=accel), rows
+
+
+def test_bad_samples_do_not_affect_the_rest(walk, still_model, without):
+    bad, rows = with_bad_samples(walk)
+    good = without(walk, np.isin(np.arange(len(walk)), rows))
+    ours, theirs = (Navigator(still_model).run(each).arrays() for each in (bad, good))
+    for name, values in theirs.items():
+        np.testing.assert_allclose(ours[name], values, rtol=0.0, atol=1e-9, err_msg=name)
 
 
 def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
-    time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
-    gyro[200:230, 1], accel[700] = np.nan, np.inf
-    time[900], time[1100], time[1101] = time[899], time[1000], time[1000]
-    bad = replace(walk, time=time, gyro=gyro, accel=accel)
+    bad, rows = with_bad_samples(walk)
     oracle = make_oracle(bad, walk.truth, CONFIG)
     track = Navigator(oracle, backend="ekf").run(bad)
     health = track.health
-    assert health.samples == {
-        "used": len(walk) - 34,
-        "not_finite": 31,
-        "frozen": 0,
-        "duplicate": 1,
-        "out_of_order": 2,
-        "future": 0,
-    }
+    bad_samples = {"not_finite": 33, "frozen": 0, "duplicate": 1, "out_of_order": 2, "future": 0}
+    assert health.samples == {"used": len(walk) - len(rows), **bad_samples}
     ((start, length),) = health.gaps
-    assert start == pytest.approx(time[199])
-    assert length == pytest.approx(time[230] - time[199])
+    assert start == pytest.approx(walk.time[199])
+    assert length == pytest.approx(walk.time[230] - walk.time[199])
     assert health.updates == len(track.innovations.time)
     assert health.refused == {}
     assert health.gated == int(track.innovations.gated.sum())
@@ -47,20 +54,20 @@ def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
     assert all("\n" not in line for line in health.lines())
 
 
-@pytest.mark.parametrize(("factor", "start"), [(1e3, 0.0), (1e9, 1.7e18), (100.0, 0.0)])
-def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, factor, start):
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        (lambda time: 1e3 * time, "give times in s"),
+        (lambda time: 1.7e18 + 1e9 * time, "give times in s"),
+        (lambda time: 100.0 * time, "give times in s"),
+        (lambda time: (time + 1.7e9).astype(np.float32), "64 bits"),  # in which they repeat
+    ],
+)
+def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, change, remedy):
     navigator = Navigator(still_model, CONFIG)
-    mistimed = replace(walk, time=start + factor * walk.time)
-    with pytest.raises(InputError, match=r"time: found samples .* s apart.*give times in s"):
-        list(stream(navigator, mistimed))
+    with pytest.raises(InputError, match=f"^time.*{remedy}"):
+        stream(navigator, replace(walk, time=change(walk.time)))
     assert navigator.state is None
-
-
-def test_times_since_1970_in_32_bits_are_refused(walk, still_model):
-    """They repeat for two minutes, in which nothing would tell why there is no state."""
-    coarse = replace(walk, time=(walk.time + 1.7e9).astype(np.float32))
-    with pytest.raises(InputError, match=r"1001 samples at 1700000000 s.*64 bits"):
-        list(stream(Navigator(still_model, CONFIG), coarse))
 
 
 @pytest.mark.parametrize(
@@ -72,7 +79,7 @@ def test_times_since_1970_in_32_bits_are_refused(walk, still_model):
     ],
 )
 def test_invalid_predictions_are_refused_and_counted(walk, make_oracle, mean, variance, reason):
-    model = Broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
+    model = broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
     track = Navigator(model, backend="ekf").run(walk)
     assert track.health.refused == {reason: track.health.updates // 3}
     assert ate(track, walk) < 0.3
@@ -82,18 +89,13 @@ def test_invalid_predictions_are_refused_and_counted(walk, make_oracle, mean, va
     ("backend", "config", "metres", "sigma"),
     [("ekf", CONFIG, 5.0, 0.02), ("graph", GRAPH, 2.0, 0.05)],
 )
-def test_outliers_do_less_harm_than_without_a_gate(
-    walk, make_oracle, backend, config, metres, sigma
-):
+def test_a_gate_makes_outliers_less_harmful(walk, make_oracle, backend, config, metres, sigma):
     open_gate = replace(config, filter=replace(config.filter, gate=1.0 - 1e-16))
-    gated, taken = (
-        Navigator(
-            Broken(make_oracle(walk, walk.truth, each, sigma=sigma), metres, sigma**2),
-            each,
-            backend=backend,
-        ).run(walk)
-        for each in (config, open_gate)
-    )
+    tracks = []
+    for each in (config, open_gate):
+        model = broken(make_oracle(walk, walk.truth, each, sigma=sigma), metres, sigma**2)
+        tracks.append(Navigator(model, each, backend=backend).run(walk))
+    gated, taken = tracks
     assert 0.5 * gated.health.updates / 3 < gated.health.gated
     assert ate(gated, walk) < (0.5 if backend == "ekf" else 0.6) * ate(taken, walk)
 
@@ -113,38 +115,31 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(make_walk, make_o
         sigma = np.sqrt(np.trace(track.covariance[late, 6:9, 6:9], axis1=1, axis2=2))
         covered.append(np.linalg.norm(error[late], axis=1) / sigma)
         # The turn within the gap is unobservable: the speed recovers, the direction does not.
-        speed, true_speed = (
-            np.linalg.norm(v[late, :2], axis=1) for v in (aligned.velocity_W, truth.velocity_W)
-        )
+        velocities = (v[late, :2] for v in (aligned.velocity_W, truth.velocity_W))
+        speed, true_speed = (np.linalg.norm(v, axis=1) for v in velocities)
         speed_errors.append(np.abs(speed - true_speed).mean())
-        before, after = (
-            np.sqrt(np.trace(track.covariance[k, 6:9, 6:9]))
-            for k in (np.searchsorted(track.time, 8.0) - 1, -1)
-        )
+        rows = np.searchsorted(track.time, 8.0) - 1, -1
+        before, after = (np.sqrt(np.trace(track.covariance[k, 6:9, 6:9])) for k in rows)
         assert after > before
     assert np.max(np.mean(covered, axis=1)) < 2.0
     assert np.max(speed_errors) < 0.25
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.9, 1.4])
-def test_a_recording_that_is_too_short_raises_a_clear_error(walk, still_model, seconds):
-    with pytest.raises(InputError, match="at least") as caught:
-        Navigator(still_model, backend="ekf").run(walk.slice(0.0, seconds))
-    assert walk.name in str(caught.value)
-
-
-def test_a_recording_of_pieces_shorter_than_a_window_raises_a_clear_error(
-    walk, still_model, without
-):
-    holed = without(walk, walk.time % 0.9 > 0.7)
-    with pytest.raises(InputError, match="unbroken stretch"):
-        Navigator(still_model, backend="ekf").run(holed)
-
-
 @pytest.mark.parametrize(
-    "vector",
-    [3.0, "abc", (1, 2, None), pd.DataFrame([[0.0, 0.0, 9.8]])],
+    ("gone", "words"),
+    [
+        (lambda time: time > 0.0, "at least"),
+        (lambda time: time > 0.9, "at least"),
+        (lambda time: time > 1.4, "at least"),
+        (lambda time: time % 0.9 > 0.7, "unbroken stretch"),
+    ],
 )
+def test_a_recording_without_a_whole_window_is_refused(walk, still_model, without, gone, words):
+    with pytest.raises(InputError, match=f"{walk.name}.*{words}"):
+        Navigator(still_model, backend="ekf").run(without(walk, gone(walk.time)))
+
+
+@pytest.mark.parametrize("vector", [3.0, "abc", (1, 2, None), pd.DataFrame([[0.0, 0.0, 9.8]])])
 def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model, vector):
     navigator = Navigator(still_model)
     with pytest.raises(InputError, match=r"^gyro: found "):
@@ -156,7 +151,7 @@ def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model, vector):
 
 @pytest.mark.parametrize("time", ["0.0", None, (1.0, 2.0), 10**400])
 def test_a_time_that_is_not_a_number_is_refused_by_name(still_model, time):
-    with pytest.raises(InputError, match=r"time: found .*, expected a number"):
+    with pytest.raises(InputError, match=r"^time.*a number"):
         Navigator(still_model).push(time, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
 
 
@@ -168,42 +163,26 @@ def test_in_its_first_second_a_stream_has_a_health_report_but_no_state(walk, sti
     assert navigator.health.lines()
 
 
-# --- time ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("wild", "count"), [(1e9, 3), (2.0, 3)])
-def test_wild_timestamps_do_not_block_a_stream(walk, make_oracle, without, wild, count):
+@pytest.mark.parametrize(
+    ("rows", "wild"),
+    [
+        ([1000, 1050, 1100, 1300, 1301, 1302], 1e9),  # far ahead, several in a row as well
+        ([1000, 1050, 1100], 2.0),
+        ([0, 7], 1e9),
+        ([0, 7], 5.0),
+    ],
+)
+def test_wild_timestamps_do_not_block_a_stream(walk, make_oracle, without, rows, wild):
     walk = walk.slice(0.0, 15.0)
-    time = walk.time.copy()
-    jumped = np.zeros(len(walk), dtype=bool)
-    # Single samples or, if far ahead, several in a row as well.
-    jumped[1000 : 1000 + 50 * count : 50] = True
-    if wild > 100.0:
-        jumped[1300 : 1300 + count] = True
-    time[jumped] += wild
-    bad, expected = replace(walk, time=time), without(walk, jumped)
+    jumped = np.isin(np.arange(len(walk)), rows)
+    expected = without(walk, jumped)
     oracle = make_oracle(expected, walk.truth, CONFIG)
     navigator = Navigator(oracle)
-    states = stream(navigator, bad)
+    states = stream(navigator, replace(walk, time=walk.time + wild * jumped))
     assert stream_deviation(states, Navigator(oracle, backend="ekf").run(expected)) < 1e-9
-    assert navigator.health.samples["future"] == jumped.sum()
+    assert navigator.health.samples["future"] == len(rows)
     assert navigator.health.samples["out_of_order"] == 0
     assert navigator.health.gaps == []
-
-
-@pytest.mark.parametrize("first", [1e9, 5.0])
-def test_a_stream_may_start_with_a_wild_timestamp(walk, make_oracle, without, first):
-    walk = walk.slice(0.0, 5.0)
-    time = walk.time.copy()
-    time[0] = time[7] = first
-    gone = np.zeros(len(walk), dtype=bool)
-    gone[[0, 7]] = True
-    expected = without(walk, gone)
-    oracle = make_oracle(expected, walk.truth, CONFIG)
-    navigator = Navigator(oracle)
-    states = stream(navigator, replace(walk, time=time))
-    assert stream_deviation(states, Navigator(oracle, backend="ekf").run(expected)) < 1e-9
-    assert navigator.health.samples["future"] == 2
 
 
 def turned_over(walk: ImuSequence, late: np.ndarray) -> ImuSequence:
@@ -211,9 +190,8 @@ def turned_over(walk: ImuSequence, late: np.ndarray) -> ImuSequence:
     turn = Rotation.from_rotvec([1.5, 1.0, -0.5])
     gyro, accel = walk.gyro.copy(), walk.accel.copy()
     gyro[late], accel[late] = turn.apply(gyro[late]), turn.apply(accel[late])
-    attitude = [*walk.truth.attitude_WB[~late]] + [
-        R * turn.inv() for R in walk.truth.attitude_WB[late]
-    ]
+    before, after = (walk.truth.attitude_WB[rows] for rows in (~late, late))
+    attitude = [*before, *(after * turn.inv())]
     truth = replace(walk.truth, attitude_WB=Rotation.concatenate(attitude))
     return replace(walk, gyro=gyro, accel=accel, truth=truth)
 
@@ -226,10 +204,8 @@ def test_after_a_long_gap_the_navigator_restarts_where_it_was(walk, make_oracle)
     truth = replace(turned.truth, time=time)
     broken = replace(turned, time=time, truth=truth)
     oracle = make_oracle(broken, truth, CONFIG)
-    track, navigator = (
-        Navigator(oracle, CONFIG, backend="ekf").run(broken),
-        Navigator(oracle, CONFIG),
-    )
+    navigator = Navigator(oracle, CONFIG)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(broken)
     assert stream_deviation(stream(navigator, broken), track) < 1e-9
     assert track.health.gaps == [(pytest.approx(10.0), pytest.approx(seconds + 0.01, rel=1e-6))]
     after = track.time > 10.0 + seconds + 4.0
@@ -256,15 +232,10 @@ def test_a_device_turned_over_in_a_gap_does_not_run_away(walk, make_oracle, back
     truth = turned.truth.at(track.time[after])
     speed = np.linalg.norm(track.trajectory.velocity_W[after], axis=1)
     assert speed.max() < 2.0 + np.linalg.norm(truth.velocity_W, axis=1).max()
-    up, true_up = (
-        t.inv().apply([0.0, 0.0, 1.0])
-        for t in (track.trajectory.attitude_WB[after], truth.attitude_WB)
-    )
+    attitudes = track.trajectory.attitude_WB[after], truth.attitude_WB
+    up, true_up = (attitude.inv().apply([0.0, 0.0, 1.0]) for attitude in attitudes)
     assert np.degrees(np.linalg.norm(up - true_up, axis=1)).mean() < 4.0
     assert np.nanmean(track.innovations.nis[track.innovations.time > 10.0]) < 6.0
-
-
-# --- values ----------------------------------------------------------------------------------
 
 
 def test_spikes_are_replaced_and_counted(walk, make_oracle):
@@ -292,10 +263,11 @@ def test_a_clipped_sensor_is_flagged_and_trusted_less(walk, make_oracle):
     limit = float(np.quantile(np.abs(walk.accel).max(axis=1), 0.9))
     clipped = replace(walk, accel=np.clip(walk.accel, -limit, limit))
     stuck = (np.abs(clipped.accel[1:]) == limit) & (clipped.accel[1:] == clipped.accel[:-1])
-    graph, whole_graph = (
-        Navigator(make_oracle(each, walk.truth, CONFIG), CONFIG).run(each)
-        for each in (clipped, walk)
-    )
+    tracks = []
+    for each in (clipped, walk):
+        oracle = make_oracle(each, walk.truth, CONFIG)
+        tracks.append(Navigator(oracle, CONFIG).run(each))
+    graph, whole_graph = tracks
     for track, whole in ((graph, whole_graph), (graph.filtered, whole_graph.filtered)):
         assert 0.3 * stuck.sum() < track.health.flagged["saturated"] <= stuck.sum()
         assert whole.health.flagged == {"spike": 0, "saturated": 0}
@@ -314,9 +286,6 @@ def test_a_network_that_claims_to_be_exact_is_not_trusted(walk, make_oracle):
 def test_a_dead_axis_is_logged_once_per_run(walk, still_model, caplog):
     Navigator(still_model, backend="ekf").run(replace(walk, gyro=walk.gyro * [1.0, 1.0, 0.0]))
     assert caplog.text.count("its z axis never changes") == 1
-
-
-# --- a network that raises an error or predicts other shapes --------------------------------------
 
 
 class Failing:
@@ -339,7 +308,7 @@ def test_a_stream_continues_after_its_network_has_failed(walk, make_oracle, back
     expected = {state.time: state.p_W for state in stream(Navigator(oracle, GRAPH), walk)}
     navigator = Navigator(Failing(oracle, {5, 6, 20}), GRAPH, backend=backend)
     states, failures = [], 0
-    for sample in zip(walk.time, walk.gyro, walk.accel, strict=True):
+    for sample in samples(walk):
         try:
             states.append(navigator.push(*sample))
         except RuntimeError:
@@ -355,21 +324,21 @@ def test_no_motion_is_lost_if_the_network_fails_within_a_hole(walk, make_oracle,
     config = replace(GRAPH, filter=replace(GRAPH.filter, update_rate=10))
     walk = walk.slice(0.0, 12.0)
     holed = without(walk, (walk.time > 10.055) & (walk.time < 10.205))
-    samples = list(zip(holed.time, holed.gyro, holed.accel, strict=True))
+    rows = list(samples(holed))
     oracle = make_oracle(holed, walk.truth, config)
     whole = Navigator(Failing(oracle, set()), config)
     calls = []
-    for sample in samples:
+    for row in rows:
         calls.append(whole.model.calls)
-        whole.push(*sample)
+        whole.push(*row)
     (k,) = np.flatnonzero(np.diff(calls) == 2)
     navigator = Navigator(Failing(oracle, {calls[k] + 1}), config)
-    for sample in samples[:k]:
-        navigator.push(*sample)
-    with pytest.raises(RuntimeError, match="out of memory"):
-        navigator.push(*samples[k])
-    for sample in samples[k + 1 :]:
-        navigator.push(*sample)
+    for row in rows[:k]:
+        navigator.push(*row)
+    with pytest.raises(RuntimeError, match="memory"):
+        navigator.push(*rows[k])
+    for row in rows[k + 1 :]:
+        navigator.push(*row)
     assert navigator.model.calls == whole.model.calls
     assert navigator.state.time == whole.state.time
     assert np.linalg.norm(navigator.state.p_W - whole.state.p_W) < 0.01
@@ -383,30 +352,27 @@ def variances(count: int) -> np.ndarray:
     return np.tile(0.01 * np.eye(3), (count, 1, 1))
 
 
+def custom(predict: Any) -> Any:
+    """A network of a function of the number of windows."""
+    return SimpleNamespace(predict=lambda windows: predict(len(windows)))
+
+
 @pytest.mark.parametrize(
     ("predict", "named"),
     [
         (lambda n: None, "NoneType"),
         (lambda n: zeros(n), "ndarray"),
-        (lambda n: (zeros(n), 0.01 * np.ones((n, 3))), r"covariances \(\d+, 3, 3\)"),
-        (lambda n: (zeros(n)[:, :2], variances(n)), r"displacements \(\d+, 3\)"),
-        (lambda n: (zeros(1), variances(1)), r"shapes \(1, 3\)"),  # would be every window's
+        (lambda n: (zeros(n), 0.01 * np.ones((n, 3))), "covariances"),
+        (lambda n: (zeros(n)[:, :2], variances(n)), "displacements"),
+        (lambda n: (zeros(1), variances(1)), "shapes"),  # would be every window's
         (lambda n: (zeros(n), variances(n) + np.triu(np.ones((3, 3)), 1)), "asymmetric"),
     ],
 )
 def test_predictions_of_other_shapes_are_refused(walk, predict, named):
-    class Custom:
-        def predict(self, windows):
-            return predict(len(windows))
-
     with pytest.raises(InputError, match=f"model.*{named}"):
-        Navigator(Custom(), backend="ekf").run(walk.slice(0.0, 4.0))
+        Navigator(custom(predict), backend="ekf").run(walk.slice(0.0, 4.0))
 
 
 def test_predictions_may_be_lists(walk):
-    class Custom:
-        def predict(self, windows):
-            return zeros(len(windows)).tolist(), variances(len(windows)).tolist()
-
-    track = Navigator(Custom(), backend="ekf").run(walk.slice(0.0, 4.0))
-    assert track.health.updates > 0
+    model = custom(lambda n: (zeros(n).tolist(), variances(n).tolist()))
+    assert Navigator(model, backend="ekf").run(walk.slice(0.0, 4.0)).health.updates > 0

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from simulated import measured
-from support import GRAPH, stream
+from support import GRAPH, samples, stream
 
 from stario.fusion import (
     FilterConfig,
@@ -23,11 +23,10 @@ from stario.fusion import (
     yaw_fix,
 )
 from stario.network import load_model
-from stario.sequences import StarioError, read_recording
-from stario.sequences.errors import InputError
-from stario.sequences.noise import ImuNoise
+from stario.sequences import ImuNoise, InputError, StarioError, read_recording
 
-LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
+EYE = np.eye(3)
+LEVEL = EYE, np.zeros(3), np.zeros(3)
 
 
 @pytest.mark.parametrize(
@@ -41,12 +40,14 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(type(model)), "model"),
         (lambda model: Navigator(model, backend="ekf").run("walk.csv"), "sequence"),
         (lambda model: Navigator(model).restore("text"), "snapshot"),
-        (lambda model: Navigator(model).update_yaw("x", 0.0, 0.1), "time.*expected a number"),
-        (lambda model: Navigator(model).update_yaw(1.0, [0, 0], 0.1), "yaw.*expected a number"),
-        (
-            lambda model: Navigator(model).update_yaw(np.datetime64("2024"), 0.0, 0.1),
-            r"time: found values of type datetime64\[Y\], expected a number",
-        ),
+        (lambda model: Navigator(model).update_yaw("x", 0.0, 0.1), "time.*a number"),
+        (lambda model: Navigator(model).update_yaw(1.0, [0, 0], 0.1), "yaw.*a number"),
+        (lambda model: Navigator(model).update_yaw(1.0, "north", 0.1), "yaw"),
+        (lambda model: Navigator(model).update_yaw(np.datetime64("2024"), 0.0, 0.1), "time.*Y"),
+        (lambda model: Navigator(model).update_position(0.0, [1.0, 2.0], EYE), "position"),
+        (lambda model: Navigator(model).update_position(0.0, [48.1, 11.5, 500.0], EYE), "east"),
+        (lambda model: Navigator(model).update_velocity(0.0, [0, 0, 0], [1, 1, 1]), "covariance"),
+        (lambda model: position_fix(0.0, [1.0, 2.0, 3.0], [0.1, 0.1, 0.2]), r"np\.diag"),
         (lambda model: Navigator(model).restore(b"xx" + Navigator(model).snapshot()), "else"),
         (lambda model: compare("walk.csv", model, NavigatorConfig()), "sequence.*read_recording"),
         (lambda model: network_track("walk.csv"), "preprocessed.*observe"),
@@ -73,7 +74,7 @@ def test_a_wrong_argument_is_named(still_model, make, named):
 @pytest.mark.parametrize("wrong", [[(1.0, "position")], ["fix"], yaw_fix(1.0, 0.0, 0.1)])
 def test_fixes_of_the_wrong_type_are_refused_with_a_remedy(walk, still_model, wrong):
     for run in (Navigator(still_model).run, partial(compare, still_model)):
-        with pytest.raises(InputError, match=r"position_fix|fixes.*a list of them"):
+        with pytest.raises(InputError, match=r"position_fix|fixes.*list"):
             run(walk, fixes=wrong)
 
 
@@ -102,7 +103,7 @@ def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model):
     navigator = Navigator(still_model)
     for k in range(10_001):
         navigator.update_position(1e6 + k, np.zeros(3), np.eye(3))
-    navigator.update_position(5.0, np.zeros(3), np.eye(3))
+    assert navigator.update_position(5.0, np.zeros(3), np.eye(3)) == "waiting"
     assert navigator.health.fixes == {"too many waiting": 2, "waiting": 10_000}
 
 
@@ -157,14 +158,14 @@ def test_a_prior_attitude_that_gravity_contradicts_is_refused(walk, still_model)
     on_its_side = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     first = walk.truth.at(walk.time[:1]).attitude_WB[0].as_matrix()
     wrong = Navigator(still_model, prior=PriorPose(on_its_side @ first, *LEVEL[1:]))
-    with pytest.raises(InputError, match=r"prior: R_WB: found a vertical \d+ degrees.*B to W"):
+    with pytest.raises(InputError, match="prior: R_WB"):
         wrong.run(walk)
     refused_at = []
-    for time, gyro, accel in zip(walk.time[:250], walk.gyro, walk.accel, strict=False):
+    for row in samples(walk.select(slice(250))):
         try:
-            wrong.push(time, gyro, accel)
+            wrong.push(*row)
         except InputError:
-            refused_at.append(time)
+            refused_at.append(row[0])
     np.testing.assert_allclose(refused_at, [1.0, 2.01], atol=0.02)
     assert wrong.state is None
     unknown = PriorPose(on_its_side @ first, *LEVEL[1:], tilt_sigma=1.0)

@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import CONFIG, GRAPH, ate, stream, stream_deviation, swivelled
+from support import CONFIG, GRAPH, ate, nav_state, samples, stream, stream_deviation, swivelled
 
-from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.evaluation.tracks import inertial_track
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
-from stario.sequences.accuracy.metrics import align, pose_errors
-from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.errors import InputError
-from stario.sequences.readers.tum import read_tum, write_tum
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, PriorPose, Track, inertial_track
+from stario.sequences import InputError, about_z, align, read_tum, write_tum, yaw_of
+from stario.sequences.accuracy.metrics import pose_errors
+
+slow = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -22,15 +20,13 @@ def track(walk, make_oracle):
 
 
 def test_results_print_without_their_arrays(track, walk, still_model):
-    nis = f"mean NIS {track.nis:.2f}"
-    assert repr(track) == f"Track(Trajectory(201 rows, 0.00 to 20.00 s at 10.0 Hz), {nis})"
     assert str(track.health).splitlines() == track.health.lines()
     navigator = Navigator(still_model)
-    assert repr(navigator.observe(walk)) == "PreprocessedRecording(200 intervals, 39 windows)"
     state = stream(navigator, walk.slice(0.0, 3.0))[-1]
-    for pose in (state, navigator.continuous, navigator.smoothed):
-        assert repr(pose).startswith(f"{type(pose).__name__}(time={pose.time:.3f} s, p_W=[")
-        assert len(repr(pose)) < 80
+    poses = state, navigator.continuous, navigator.smoothed
+    for result in (track, navigator.observe(walk), *poses):
+        assert repr(result).startswith(f"{type(result).__name__}(")
+        assert len(repr(result)) < 80
 
 
 def test_the_states_of_a_stream_become_a_track_that_can_be_written(walk, still_model, tmp_path):
@@ -41,18 +37,11 @@ def test_the_states_of_a_stream_become_a_track_that_can_be_written(walk, still_m
     np.testing.assert_allclose(read.time, [state.time for state in states])
     np.testing.assert_allclose(read.position_W, [state.p_W for state in states], atol=1e-8)
     moved = [*states, replace(states[-1], time=9.0, map_frame=1)]
-    for wrong, words in (
-        ([], "found none"),
-        (moved, "2 map frames"),
-        ([None], "collect what push"),
-    ):
+    for wrong, words in (([], "none"), (moved, "2 map frames"), ([None], "push")):
         with pytest.raises(InputError, match=words):
             Track.from_states(wrong)
     with pytest.raises(InputError, match=r"Track\.from_states"):
         write_tum(tmp_path / "walk.tum", states)
-
-
-# --- accuracy --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket"])
@@ -67,14 +56,12 @@ def test_the_error_stays_far_below_that_of_dead_reckoning(make_walk, make_oracle
 
 
 def test_the_blocks_of_the_covariance_have_names():
-    covariance, zero = np.arange(225.0).reshape(15, 15), np.zeros(3)
-    state = NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
+    state = nav_state(np.arange(225.0).reshape(15, 15))
     names = ("attitude", "velocity", "position", "gyro_bias", "accel_bias")
-    for first, name in zip(range(0, 15, 3), names, strict=True):
-        block = slice(first, first + 3)
-        np.testing.assert_array_equal(
-            getattr(state, f"{name}_covariance"), covariance[block, block]
-        )
+    for k, name in enumerate(names):
+        block = slice(3 * k, 3 * k + 3)
+        expected = state.covariance[block, block]
+        np.testing.assert_array_equal(getattr(state, f"{name}_covariance"), expected)
 
 
 def test_attitude_and_speed_are_estimated_too(walk, track):
@@ -87,19 +74,15 @@ def test_attitude_and_speed_are_estimated_too(walk, track):
     assert np.degrees(turn.magnitude()[late].mean()) < 3.0
 
 
-@pytest.mark.parametrize("rate", [50.0, 1000.0])
-def test_the_track_is_accurate_at_any_imu_rate(make_walk, make_oracle, rate):
+@pytest.mark.parametrize(
+    ("rate", "update_rate"),
+    [(50.0, 2), (1000.0, 2), (100.0, 1), (100.0, 5), pytest.param(100.0, 20, marks=slow)],
+)
+def test_the_track_is_accurate_at_any_rate(make_walk, make_oracle, rate, update_rate):
     walk = make_walk(4, 12.0, rate)
-    assert (
-        ate(Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(walk), walk) < 0.2
-    )
-
-
-@pytest.mark.parametrize("update_rate", [1, 5, pytest.param(20, marks=pytest.mark.slow)])
-def test_the_track_is_accurate_at_every_update_rate(walk, make_oracle, update_rate):
     config = NavigatorConfig(filter=FilterConfig(update_rate=update_rate))
     track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
-    assert ate(track, walk) < 0.3
+    assert ate(track, walk) < 0.2
     np.testing.assert_allclose(np.diff(track.time), 1.0 / config.filter.output_rate, atol=1e-9)
 
 
@@ -116,9 +99,6 @@ def test_a_track_starts_at_the_prior_pose(walk, make_oracle):
     off = track.trajectory.velocity_W - known.velocity_W
     assert np.linalg.norm(off[:20], axis=1).max() < 0.3
     assert stream_deviation(stream(navigator, walk), track.filtered) < 1e-9
-
-
-# --- one estimator for stream and batch ---------------------------------------------------------
 
 
 def test_stream_equals_batch_through_gaps_and_bad_samples(walk, make_oracle, without):
@@ -138,7 +118,7 @@ def test_stream_equals_batch_through_gaps_and_bad_samples(walk, make_oracle, wit
 def test_run_does_not_disturb_a_stream_in_progress(walk, make_oracle, track):
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
     half = len(walk) // 2
-    rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
+    rows = list(samples(walk))
     states = [navigator.push(*row) for row in rows[:half]]
     again = navigator.run(walk)
     states += [navigator.push(*row) for row in rows[half:]]
@@ -163,31 +143,21 @@ def test_times_since_1970_give_the_same_track(walk, make_oracle, track):
     assert np.abs(ours.trajectory.position_W - track.trajectory.position_W).max() < 5e-3
 
 
-# --- symmetries ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("backend", "mount", "atol"),
-    [
-        ("ekf", (3.1, 0.0, 0.0), 1e-6),
-        ("graph", (1.5, 1.0, -0.5), 1e-4),
-    ],
+    [("ekf", (3.1, 0.0, 0.0), 1e-6), ("graph", (1.5, 1.0, -0.5), 1e-4)],
 )
-def test_another_mount_only_turns_the_track_about_the_vertical(
-    walk, make_oracle, backend, mount, atol
-):
-    R_BM, config = Rotation.from_rotvec(mount), CONFIG if backend == "ekf" else GRAPH
+def test_another_mount_only_turns_the_track(walk, make_oracle, backend, mount, atol):
+    R_BM = Rotation.from_rotvec(mount)
+    config = CONFIG if backend == "ekf" else GRAPH
     walk = walk.slice(0.0, 10.0)
-    turned = replace(
-        walk,
-        gyro=R_BM.apply(walk.gyro, inverse=True),
-        accel=R_BM.apply(walk.accel, inverse=True),
-        truth=replace(walk.truth, attitude_WB=walk.truth.attitude_WB * R_BM),
-    )
-    ours, theirs = (
-        Navigator(make_oracle(s, s.truth, config), config, backend=backend).run(s).trajectory
-        for s in (turned, walk)
-    )
+    gyro, accel = (R_BM.apply(values, inverse=True) for values in (walk.gyro, walk.accel))
+    truth = replace(walk.truth, attitude_WB=walk.truth.attitude_WB * R_BM)
+    tracks = []
+    for each in (replace(walk, gyro=gyro, accel=accel, truth=truth), walk):
+        oracle = make_oracle(each, each.truth, config)
+        tracks.append(Navigator(oracle, config, backend=backend).run(each).trajectory)
+    ours, theirs = tracks
     turn = ours.attitude_WB * (theirs.attitude_WB * R_BM).inv()
     assert np.ptp(np.unwrap(yaw_of(turn))) < atol
     back = about_z(float(yaw_of(turn)[0])).apply(ours.position_W, inverse=True)
@@ -196,8 +166,6 @@ def test_another_mount_only_turns_the_track_about_the_vertical(
 
 def test_the_first_tilt_is_less_certain_the_faster_the_device_turns(make_walk, still_model):
     walk = make_walk(3, 3.0)
-    slow, fast = (
-        np.sqrt(Navigator(still_model, backend="ekf").run(each).covariance[0, 0, 0])
-        for each in (walk, swivelled(walk, 3.0))
-    )
+    tracks = (Navigator(still_model, backend="ekf").run(s) for s in (walk, swivelled(walk, 3.0)))
+    slow, fast = (np.sqrt(track.covariance[0, 0, 0]) for track in tracks)
     assert fast > 2.0 * slow

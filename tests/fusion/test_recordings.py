@@ -5,9 +5,8 @@ import pytest
 from recorded import DATA
 from support import stream
 
-from stario.fusion import Navigator
-from stario.fusion.evaluation.compare import compare, measure
-from stario.fusion.values.config import NavigatorConfig
+from stario.fusion import Navigator, NavigatorConfig, compare
+from stario.fusion.evaluation.compare import measure
 from stario.network import load_model
 from stario.sequences import ImuSequence, read_recording
 

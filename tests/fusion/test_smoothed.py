@@ -1,6 +1,8 @@
 """A recording is smoothed as a whole, a stream by a window; both gain on the filter's states."""
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +10,9 @@ from scipy.spatial.transform import Rotation
 from support import CONFIG as PHONE
 from support import WHITE as CONFIG
 from support import WHITE_ERRORS as ERRORS
-from support import stream
+from support import nav_state, samples, stream
 
-from stario.fusion import Navigator, NavState, SmoothedPose
-from stario.fusion.values.fixes import position_fix
+from stario.fusion import Navigator, NavState, SmoothedPose, position_fix
 from stario.fusion.values.state import MAX_STEP, advanced
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -24,12 +25,9 @@ def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
 @pytest.fixture(scope="module")
 def walks(make_walk, make_oracle):
     """Walks, each with a model that measures its displacements with white noise."""
-    made = [make_walk(seed, 30.0, 50.0, ERRORS) for seed in range(5)]
-    noise = {"noise": 0.1, "sigma": 0.1}
-    return [
-        (walk, make_oracle(walk, walk.truth, CONFIG, seed=k, **noise))
-        for k, walk in enumerate(made)
-    ]
+    walks = [make_walk(seed, 30.0, 50.0, ERRORS) for seed in range(5)]
+    oracle = partial(make_oracle, config=CONFIG, noise=0.1, sigma=0.1)
+    return [(walk, oracle(walk, walk.truth, seed=k)) for k, walk in enumerate(walks)]
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +35,13 @@ def tracks(walks):
     return [(walk, Navigator(model, CONFIG).run(walk)) for walk, model in walks]
 
 
-# --- recordings ------------------------------------------------------------------------------
-
-
 def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(tracks):
     filtered, smoothed, nees = [], [], []
     for walk, track in tracks:
         error = errors_at(track.trajectory, walk)[5:]
         smoothed.append(np.square(error).sum(axis=1).mean())
-        filtered.append(
-            np.square(errors_at(track.filtered.trajectory, walk)[5:]).sum(axis=1).mean()
-        )
+        theirs = errors_at(track.filtered.trajectory, walk)[5:]
+        filtered.append(np.square(theirs).sum(axis=1).mean())
         P = align(track.trajectory, walk.truth, "first").position_covariance_W[5:]
         nees.append(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]))
     assert np.mean(smoothed) < 0.95 * np.mean(filtered)
@@ -69,15 +63,18 @@ def test_a_closed_walk_is_not_doubted(walk, still_model):
     assert Navigator(still_model, closed).run(walk).health.notes == []
 
 
-def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(tracks):
-    def steps(track):
-        p, v, t = track.trajectory.position_W, track.trajectory.velocity_W, track.time
-        moved = 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
-        return np.linalg.norm(np.diff(p, axis=0) - moved, axis=1)
+def steps(time: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Distances [m] between positions that the velocity does not explain."""
+    moved = 0.5 * np.diff(time)[:, None] * (velocity[1:] + velocity[:-1])
+    return np.linalg.norm(np.diff(position, axis=0) - moved, axis=1)
 
+
+def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(tracks):
     for _, track in tracks:
-        assert steps(track).max() < 0.03
-        assert steps(track.filtered).max() > 0.05
+        both = track.trajectory, track.filtered.trajectory
+        smoothed, filtered = (steps(t.time, t.position_W, t.velocity_W) for t in both)
+        assert smoothed.max() < 0.03
+        assert filtered.max() > 0.05
 
 
 def test_a_bias_known_at_the_end_mends_the_beginning(tracks):
@@ -103,13 +100,10 @@ def test_the_filters_track_stands_beside_and_is_the_streams(walks, tracks):
     np.testing.assert_allclose(track.trajectory.position_W[-1], streamed.p_W, atol=0.1)
 
 
-# --- streams ---------------------------------------------------------------------------------
-
-
 def delayed(navigator: Navigator, walk: ImuSequence) -> list[SmoothedPose]:
     """Return the poses that a stream gives one window late."""
     poses: list[SmoothedPose] = []
-    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+    for row in samples(walk):
         pose = navigator.smoothed if navigator.push(*row) is not None else None
         if pose is not None and (not poses or pose.time > poses[-1].time):
             poses.append(pose)
@@ -126,9 +120,8 @@ def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states
         assert time[-1] == pytest.approx(track.time[-1] - 1.0)
         at = np.searchsorted(track.time, time - 1e-6)
         P = np.array([pose.covariance[3:, 3:] for pose in poses])
-        sigmas = [
-            np.trace(p, axis1=1, axis2=2) for p in (P, track.filtered.covariance[at, 6:9, 6:9])
-        ]
+        covariances = P, track.filtered.covariance[at, 6:9, 6:9]
+        sigmas = [np.trace(each, axis1=1, axis2=2) for each in covariances]
         # The gains do not know the network's scale error, which the covariances contain.
         assert (sigmas[0][2:] <= 1.05 * sigmas[1][2:]).all()
         assert np.median(sigmas[0] / sigmas[1]) < 0.99
@@ -142,14 +135,12 @@ def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states
     assert 1.4 < np.median(np.concatenate(nees)) < 3.4  # median of chi-square with 3 DoF: 2.4
 
 
-def test_a_smoothed_pose_of_unknown_direction_is_as_uncertain_as_the_newest_state(
-    make_walk, make_oracle
-):
+def test_a_smoothed_pose_is_as_uncertain_of_its_yaw_as_the_state(make_walk, make_oracle):
     """One position places the track and leaves its yaw in the map unknown."""
     walk = make_walk(1, 8.0, 100.0, ERRORS)
     fix = position_fix(3.0, walk.truth.at(np.array([3.0])).position_W[0], 1e-3 * np.eye(3))
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
-    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+    for row in samples(walk):
         if row[0] == pytest.approx(3.5):
             navigator.update_position(fix.time, fix.value, fix.covariance)
             released = navigator.smoothed  # before the fix, and now in its frame
@@ -161,13 +152,9 @@ def test_a_smoothed_pose_of_unknown_direction_is_as_uncertain_as_the_newest_stat
     assert pose.covariance[2, 2] == pytest.approx(yaw_variance, rel=0.05)
 
 
-# --- the continuous position never steps, and converges to the corrected one ----------------------
-
-
-def state_at(time: float, x: float, map_frame: int = 0) -> NavState:
-    zero, v_W = np.zeros(3), np.array([1.0, 0.0, 0.0])
-    p_W = np.array([time + x, 0.0, 0.0])
-    return NavState(time, np.eye(3), v_W, p_W, zero, zero, np.eye(15), False, map_frame)
+def state_at(time: float, x: float, **parts: Any) -> NavState:
+    v_W, p_W = np.array([[1.0, 0.0, 0.0], [time + x, 0.0, 0.0]])
+    return nav_state(np.eye(15), time, v_W=v_W, p_W=p_W, **parts)
 
 
 def test_a_step_is_bled_in_a_centimetre_at_a_time():
@@ -182,25 +169,23 @@ def test_a_step_is_bled_in_a_centimetre_at_a_time():
     assert remaining[-1] < 0.01
 
 
-def test_the_continuous_position_is_reset_where_fixes_move_the_frame():
-    pose = advanced(advanced(None, state_at(0.0, 0.0)), state_at(0.1, 100.0, map_frame=1))
+@pytest.mark.parametrize("changed", [{"map_frame": 1}, {"in_gap": True}])
+def test_the_continuous_position_is_reset_where_fixes_move_the_frame_and_after_a_gap(changed):
+    after = state_at(3.0, 5.0, **changed)
+    pose = advanced(advanced(None, state_at(0.0, 0.0)), after)
+    np.testing.assert_array_equal(pose.p_W, after.p_W)
     np.testing.assert_array_equal(pose.correction_W, np.zeros(3))
 
 
 def test_corrections_cause_no_step_in_the_position(walk, make_oracle):
     """Noise of a quarter of a metre makes the corrected position step, not the continuous one."""
     navigator = Navigator(make_oracle(walk, walk.truth, PHONE, noise=0.25, sigma=0.25), PHONE)
-    poses = []
-    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
-        if navigator.push(*row) is not None:
-            poses.append(navigator.continuous)
-    p, v, t = (np.array([getattr(q, name) for q in poses]) for name in ("p_W", "v_W", "time"))
-    moved = np.diff(p, axis=0) - 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
-    assert np.linalg.norm(moved, axis=1).max() < MAX_STEP + 1e-9
-    corrected = p + np.array([q.correction_W for q in poses])
-    stepped = np.diff(corrected, axis=0) - 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
-    assert np.linalg.norm(stepped, axis=1).max() > 2.0 * MAX_STEP
-    assert np.linalg.norm(poses[-1].correction_W) < 0.5
+    poses = [navigator.continuous for row in samples(walk) if navigator.push(*row) is not None]
+    names = ("time", "p_W", "v_W", "correction_W")
+    time, p_W, v_W, correction_W = (np.array([getattr(q, name) for q in poses]) for name in names)
+    assert steps(time, p_W, v_W).max() < MAX_STEP + 1e-9
+    assert steps(time, p_W + correction_W, v_W).max() > 2.0 * MAX_STEP
+    assert np.linalg.norm(correction_W[-1]) < 0.5
 
 
 def test_a_late_fix_that_moves_the_map_moves_the_continuous_position_at_once(walk, make_oracle):
@@ -216,7 +201,7 @@ def test_returned_arrays_may_be_overwritten(walk, make_oracle):
     walk, ends = walk.slice(0.0, 5.0), []
     for overwrite in (False, True):
         navigator = Navigator(make_oracle(walk, walk.truth, PHONE), PHONE)
-        for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        for row in samples(walk):
             state = navigator.push(*row)
             if state is not None and overwrite:
                 for returned in (state, navigator.continuous, navigator.state):
@@ -226,9 +211,3 @@ def test_returned_arrays_may_be_overwritten(walk, make_oracle):
         ends.append((navigator.state.p_W, navigator.state.b_g, navigator.continuous.p_W))
     for clean, written in zip(*ends, strict=True):
         np.testing.assert_array_equal(clean, written)
-
-
-def test_the_continuous_position_is_reset_at_the_end_of_a_gap():
-    before = advanced(None, state_at(0.0, 0.0))
-    after = replace(state_at(3.0, 5.0), in_gap=True)
-    np.testing.assert_array_equal(advanced(before, after).p_W, after.p_W)

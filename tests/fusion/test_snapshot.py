@@ -5,17 +5,18 @@ import tracemalloc
 import zlib
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from support import stream
+from simulated import Still
+from support import samples, stream
 
-from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, NavState, PriorPose
 from stario.fusion.filter.alternative import AlternativeHypothesis
 from stario.fusion.snapshot import VERSION, plain, unpack
-from stario.fusion.values.config import FilterConfig
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))
 
@@ -31,9 +32,12 @@ def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
-@pytest.mark.parametrize("stop", [0.5, 1.0, 7.37, 12.2, 14.41])
-def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, stop):
-    """Stopped in the first second, later, or next to a gap, with waiting and with late fixes."""
+STOPS = [("ekf", 0.5), ("ekf", 1.0), ("ekf", 7.37), ("ekf", 12.2), ("ekf", 14.41), ("graph", 14.41)]
+
+
+@pytest.mark.parametrize(("backend", "stop"), STOPS)
+def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, backend, stop):
+    """Stopped in the first second, later, or next to a gap, with a prior, and with fixes."""
     holed = without(walk, (walk.time > 12.3) & (walk.time < 13.8))
     accel = holed.accel.copy()
     accel[300] += 400.0
@@ -45,7 +49,8 @@ def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, sto
             p = walk.truth.at(np.array([stop - 0.4])).position_W[0]
             navigator.update_position(stop - 0.4, p, 0.01 * np.eye(3))
 
-    whole, first, second = (Navigator(model, CONFIG) for _ in range(3))
+    prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
+    whole, first, second = (Navigator(model, CONFIG, p, backend) for p in (prior, prior, None))
     for navigator in (whole, first):
         navigator.update_position(stop + 0.5, np.ones(3), np.eye(3))
         navigator.update_position(4.0, np.zeros(3), 0.01 * np.eye(3))
@@ -58,45 +63,31 @@ def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, sto
     for navigator in (whole, second):
         late_fix(navigator)
     later = stop + 4.0
-    assert_same(push(second, holed, stop, later), push(whole, holed, stop, later))
+    states = push(whole, holed, stop, later)
+    assert_same(push(second, holed, stop, later), states)
+    # A stream is silent until a second after a gap.
+    assert not any(12.35 < state.time < 14.75 for state in states)
     assert second.health == whole.health
     assert second.health.fixes["value that is not finite"] == 1
 
 
-def test_a_snapshot_includes_the_prior(walk, make_oracle):
-    walk = walk.slice(0.0, 5.0)
-    model = make_oracle(walk, walk.truth, CONFIG)
-    prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
-    whole, other = Navigator(model, CONFIG, prior), Navigator(model, CONFIG)
-    push(whole, walk, 0.0, 0.4)
-    other.restore(whole.snapshot())
-    assert_same(push(other, walk, 0.4, 5.0), push(whole, walk, 0.4, 5.0))
-
-
-# --- refused ---------------------------------------------------------------------------------
-
-
-class ModelWithCard:
-    def __init__(self, sha256: str) -> None:
-        self.card = type("Card", (), {"sha256": sha256})()
-
-    def predict(self, windows):
-        return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
+def model_with_card(sha256: str) -> Any:
+    return SimpleNamespace(predict=Still().predict, card=SimpleNamespace(sha256=sha256))
 
 
 def test_a_snapshot_of_another_configuration_or_model_is_refused_by_name(walk):
-    navigator = Navigator(ModelWithCard("abc"), CONFIG)
+    navigator = Navigator(model_with_card("abc"), CONFIG)
     push(navigator, walk, 0.0, 2.0)
-    data = navigator.snapshot()
     coarser = replace(CONFIG, filter=replace(CONFIG.filter, yaw_sigma=0.5))
-    with pytest.raises(InputError, match=r"config\.filter\.yaw_sigma: found 0\.001, expected 0\.5"):
-        Navigator(ModelWithCard("abc"), coarser).restore(data)
-    with pytest.raises(InputError, match="model: found 'abc'"):
-        Navigator(ModelWithCard("def"), CONFIG).restore(data)
-    other = Navigator(ModelWithCard("abc"), CONFIG, backend="graph")
-    with pytest.raises(InputError, match="backend"):
-        other.restore(data)
-    assert other.state is None
+    for sha256, config, backend, named in (
+        ("abc", coarser, "ekf", r"config\.filter\.yaw_sigma.*0\.001.*0\.5"),
+        ("def", CONFIG, "ekf", "model: found 'abc'"),
+        ("abc", CONFIG, "graph", "backend"),
+    ):
+        other = Navigator(model_with_card(sha256), config, backend=backend)
+        with pytest.raises(InputError, match=named):
+            other.restore(navigator.snapshot())
+        assert other.state is None
 
 
 def test_bytes_that_are_no_snapshot_are_refused(walk, still_model):
@@ -110,8 +101,8 @@ def test_bytes_that_are_no_snapshot_are_refused(walk, still_model):
     edited = data.replace(b"false", b"true ", 1), data.replace(b"<f8", b"<i8", 1)
     for bad, words in (
         *((part, "snapshot") for part in (b"", b"nonsense", data[:1000], data[:-30], flipped)),
-        *((part, r"snapshot: found edited.*begin a new stream") for part in edited),
-        (older, f"version: found 1, expected {VERSION}"),
+        *((part, "snapshot: found edited") for part in edited),
+        (older, f"version.*1.*{VERSION}"),
     ):
         assert bad != data
         with pytest.raises(InputError, match=words) as caught:
@@ -146,15 +137,13 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(walk, s
             navigator.update_position(time, zero, np.eye(3))
             navigator.update_velocity(time, zero, np.eye(3))
             navigator.update_yaw(time, 0.3, 0.5)
-        for row in zip(*(part[:400] for part in (walk.time, walk.gyro, walk.accel)), strict=True):
+        for row in samples(walk.select(slice(400))):
             navigator.push_magnetometer(row[0], np.array([20.0 + row[0], 5.0, -40.0]))
             navigator.push_pressure(row[0], 1000.0)
             navigator.push(*row)
         visit(plain(unpack(navigator.snapshot()), {}))
-    rare = [
-        AlternativeHypothesis(navigator._stream.state.ekf, (0.0,)),
-        PriorPose(np.eye(3), zero, zero),
-    ]
+    rare = [AlternativeHypothesis(navigator._stream.state.ekf, (0.0,))]
+    rare += [PriorPose(np.eye(3), zero, zero)]
     visit(plain(rare, {}))
     names = {line.partition(":")[0] for line in found}
     assert names >= {"FieldState", "FrameTransform", "Fix", "Bearing", "Position", "Yaw"}
@@ -163,30 +152,6 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(walk, s
     assert LAYOUTS.get(VERSION) == layout, f"raise VERSION, and note its layout {layout} here"
 
 
-@pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_stream_is_silent_until_a_second_after_a_gap_and_a_snapshot_keeps_that_second(
-    walk, still_model, without, backend
-):
-    holed = without(walk, (walk.time > 5.0) & (walk.time < 5.6))
-    expected, resumed = (Navigator(still_model, CONFIG, backend=backend) for _ in range(2))
-    push(resumed, holed, 0.0, 6.0)
-    data = resumed.snapshot()
-    resumed = Navigator(still_model, CONFIG, backend=backend)
-    resumed.restore(data)
-    push(expected, holed, 0.0, 6.0)
-    for row in zip(holed.time, holed.gyro, holed.accel, strict=True):
-        if row[0] > 6.0:
-            state, other = expected.push(*row), resumed.push(*row)
-            if state is not None:
-                break
-    assert state.time == pytest.approx(6.6, abs=0.02)
-    np.testing.assert_allclose(other.p_W, state.p_W, atol=1e-9)
-
-
-# --- memory ---------------------------------------------------------------------------------------
-
-
-BYTES_PER_NUMBER = 16
 RATE = 50.0
 
 
@@ -209,16 +174,18 @@ def memory_growth(navigator: Navigator, walk: ImuSequence, warm_up: float, secon
         tracemalloc.stop()
 
 
-def test_the_memory_of_a_stream_does_not_grow(make_walk, still_model):
-    growth = memory_growth(Navigator(still_model), make_walk(1, 12.0, RATE), 8.0, 12.0)
-    # One number per sample.
-    assert growth < BYTES_PER_NUMBER * RATE * 12.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_the_memory_of_an_hours_stream_does_not_grow(make_walk, still_model, backend):
+@pytest.mark.parametrize(
+    ("backend", "warm_up", "seconds", "numbers"),
+    [
+        ("ekf", 8.0, 12.0, RATE),  # one per sample
+        *(
+            pytest.param(backend, 120.0, 3600.0, 1.0, marks=pytest.mark.slow)  # and per 2 updates
+            for backend in ("ekf", "graph")
+        ),
+    ],
+)
+def test_a_streams_memory_is_bounded(make_walk, still_model, backend, warm_up, seconds, numbers):
+    """By that many numbers a second, of 16 bytes each."""
     navigator = Navigator(still_model, backend=backend)
-    growth = memory_growth(navigator, make_walk(1, 30.0, RATE), 120.0, 3600.0)
-    # Half of one number per network update.
-    assert growth < 0.5 * BYTES_PER_NUMBER * 2.0 * 3600.0
+    growth = memory_growth(navigator, make_walk(1, 12.0, RATE), warm_up, seconds)
+    assert growth < 16 * numbers * seconds

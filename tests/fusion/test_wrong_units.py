@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import CONFIG, stream, stream_deviation
+from support import CONFIG, samples, stream, stream_deviation
 
 from stario.fusion import Navigator
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences import STANDARD_GRAVITY, ImuSequence, InputError
 
 
 def specific_force(walk: ImuSequence) -> np.ndarray:
@@ -33,7 +32,7 @@ def test_wrong_units_and_missing_gravity_are_refused(walk, still_model, wrong, r
 @pytest.mark.parametrize("scale", [1 / 9.80665, 0.0])
 def test_a_stream_in_wrong_units_is_refused_after_its_first_second(walk, make_oracle, scale):
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
-    with pytest.raises(InputError, match="accel: found an average"):
+    with pytest.raises(InputError, match="accel"):
         stream(navigator, replace(walk, accel=scale * walk.accel))
     assert navigator.state is None
     track = Navigator(navigator.model, backend="ekf").run(walk)
@@ -43,12 +42,14 @@ def test_a_stream_in_wrong_units_is_refused_after_its_first_second(walk, make_or
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (lambda gyro, accel: (np.degrees(gyro) + 40.0, accel), r"gyro: .*np\.radians\(gyro\)"),
-        (lambda gyro, accel: (accel, gyro), "gyro and accel are swapped"),
+        # In deg/s the force averages to nothing, although each sample of it is right.
+        (lambda gyro, accel: (np.degrees(gyro) + 40.0, accel), r"^gyro.*np\.radians\(gyro\)"),
+        (lambda gyro, accel: (accel, gyro), "swapped"),
+        (lambda gyro, accel: (gyro[:, [1, 0, 2]], accel), "^gyro.* y, x, z$"),
     ],
 )
-def test_the_first_second_of_a_stream_blames_the_right_sensor(walk, still_model, wrong, words):
-    """In deg/s the force averages to nothing, although each sample of it is right."""
+def test_a_stream_blames_the_right_sensor(make_walk, still_model, wrong, words):
+    walk = make_walk(1, 26.0, carry="pocket")
     gyro, accel = wrong(walk.gyro, walk.accel)
     with pytest.raises(InputError, match=words):
         stream(Navigator(still_model), replace(walk, gyro=gyro, accel=accel))
@@ -61,7 +62,7 @@ def test_an_inverted_accelerometer_and_a_field_in_gauss_are_said(still_model, ca
         navigator.push_magnetometer(0.01 * k, [0.2, row[0], -0.43])
         navigator.push(0.01 * k, row[:3], row[3:] - [0.0, 0.0, STANDARD_GRAVITY])
     assert "give -accel" in caplog.text
-    assert caplog.text.count("if in gauss, give 100 * field") == 1
+    assert caplog.text.count("gauss") == 1
 
 
 def after_a_still_start(walk: ImuSequence) -> ImuSequence:
@@ -70,20 +71,17 @@ def after_a_still_start(walk: ImuSequence) -> ImuSequence:
     rest = round(10.0 / step)
     noise = 0.01 * np.random.default_rng(0).standard_normal((rest, 6))
     up_B = specific_force(walk)[0]
-    return replace(
-        walk,
-        time=step * np.arange(rest + len(walk)),
-        gyro=np.vstack([noise[:, :3], walk.gyro]),
-        accel=np.vstack([up_B + noise[:, 3:], walk.accel]),
-        truth=None,
-    )
+    time = step * np.arange(rest + len(walk))
+    gyro = np.vstack([noise[:, :3], walk.gyro])
+    accel = np.vstack([up_B + noise[:, 3:], walk.accel])
+    return replace(walk, time=time, gyro=gyro, accel=accel, truth=None)
 
 
 def test_a_stream_in_degrees_is_refused_once_the_device_turns(make_walk, still_model):
     right = after_a_still_start(make_walk(3, 16.0, carry="swinging"))
     navigator = Navigator(still_model)
     stream(navigator, right.select(slice(300)))
-    with pytest.raises(InputError, match=r"gyro: found rotations .*, expected rad/s; .*deg/s"):
+    with pytest.raises(InputError, match=r"gyro.*rad/s.*deg/s"):
         stream(navigator, replace(right, gyro=np.degrees(right.gyro)).slice(3.0, 36.0))
     assert navigator.state is None
     # The stream has restarted; in rad/s it is never refused.
@@ -95,7 +93,7 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(make_walk, st
     right = after_a_still_start(make_walk(1, 26.0)).slice(0.0, 20.0)
     dead = replace(right, **{sensor: np.tile(getattr(right, sensor)[0], (len(right), 1))})
     navigator = Navigator(still_model)
-    with pytest.raises(InputError, match=f"{sensor}: found values that never change"):
+    with pytest.raises(InputError, match=f"{sensor}.*never change"):
         stream(navigator, dead)
     assert navigator.state is None
     assert stream(navigator, right.slice(0.0, 3.0))
@@ -110,17 +108,10 @@ def starts_and_stops(gyro: np.ndarray) -> ImuSequence:
 
 
 def test_calm_in_between_does_not_hide_a_gyroscope_that_is_dead_from_the_beginning(still_model):
-    with pytest.raises(InputError, match="gyro: found values that never change"):
+    with pytest.raises(InputError, match=r"gyro.*never change"):
         stream(Navigator(still_model), starts_and_stops(np.zeros((4, 3))))
     live = np.outer([0.0, 0.001, 0.0, 0.002], [1.0, 1.0, 1.0])
     assert stream(Navigator(still_model), starts_and_stops(live))[-1].time > 47.0
-
-
-def test_a_stream_whose_gyroscope_has_other_axes_is_refused(make_walk, still_model):
-    walk = make_walk(1, 26.0, carry="pocket")
-    swapped = replace(walk, gyro=walk.gyro[:, [1, 0, 2]])
-    with pytest.raises(InputError, match=r"gyro: .* x, y, z seem to be its y, x, z$"):
-        stream(Navigator(still_model), swapped)
 
 
 def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(make_walk, still_model):
@@ -149,14 +140,14 @@ def test_the_check_for_degrees_survives_a_snapshot(walk, still_model):
     def refused_at(stop):
         """Time at which the stream is refused if another navigator continues it at `stop`."""
         navigator = Navigator(still_model)
-        for time, gyro, accel in zip(wrong.time, wrong.gyro, wrong.accel, strict=True):
-            if time == stop:
+        for row in samples(wrong):
+            if row[0] == stop:
                 data, navigator = navigator.snapshot(), Navigator(still_model)
                 navigator.restore(data)
             try:
-                navigator.push(time, gyro, accel)
+                navigator.push(*row)
             except InputError:
-                return float(time)
+                return float(row[0])
         return np.inf
 
     whole = refused_at(np.nan)

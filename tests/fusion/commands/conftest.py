@@ -67,7 +67,7 @@ def stario(monkeypatch, tmp_path, tmp_path_factory, capsys):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    """Skip figures, which take most of the time, in tests that do not check them."""
+    """Skip figures, in tests that do not check them."""
     monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda found: {})
     saved = "stario.sequences.drawing.figures.save_figure"  # of `inspect`
     monkeypatch.setattr(saved, lambda figure, path: path.touch())

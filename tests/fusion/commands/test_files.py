@@ -12,13 +12,16 @@ from stario.network.architectures import build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model, save_model
-from stario.sequences.readers import find_recordings
+from stario.sequences import (
+    ImuSequence,
+    PositionTrack,
+    find_recordings,
+    generate_walk,
+    read_tum,
+    simulate_imu,
+)
 from stario.sequences.readers.archive import write_archive
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.readers.tum import read_tum
-from stario.sequences.sequence import PositionTrack
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import generate_walk
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -78,12 +81,17 @@ def test_overwrite_replaces_an_euroc_folder_and_nothing_else(stario, recording, 
     assert imu.read_text() == written
 
 
+def tapped(time: np.ndarray, kind: str) -> ImuSequence:
+    """A walk of eight seconds of which no poses are known, but positions at these times."""
+    walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
+    position_W = walk.truth.at(time).position_W
+    known = position_W[:, :2] if kind == "waypoints" else position_W
+    return replace(walk, truth=None, positions=PositionTrack(time, known, kind))
+
+
 @pytest.mark.usefixtures("no_figures")
 def test_every_track_is_compared_with_positions_half_a_second_apart(stario, tmp_path):
-    walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
-    time = np.arange(1.0, 7.0, 0.5)
-    known = PositionTrack(time, walk.truth.at(time).position_W, "positions")
-    write_archive(tmp_path / "taps.h5", [replace(walk, truth=None, positions=known)])
+    write_archive(tmp_path / "taps.h5", [tapped(np.arange(1.0, 7.0, 0.5), "positions")])
     first, head, *rows = stario("compare", "taps.h5", "--tracks", "all").out.splitlines()[:7]
     assert "12 of 12 positions lie within the track" in first
     assert head.split()[:2] == ["positions", "[m]"]
@@ -94,9 +102,7 @@ def test_every_track_is_compared_with_positions_half_a_second_apart(stario, tmp_
 
 @pytest.mark.usefixtures("no_figures")
 def test_waypoints_are_reported_and_do_not_count_as_poses(stario, tmp_path):
-    walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
-    taps = PositionTrack(np.array([1.0, 6.0]), np.zeros((2, 2)), "waypoints")
-    write_archive(tmp_path / "taps.h5", [replace(walk, truth=None, positions=taps)])
+    write_archive(tmp_path / "taps.h5", [tapped(np.array([1.0, 6.0]), "waypoints")])
     done = stario("run", "taps.h5")
     assert done.code == 0, done.err
     assert "truth: 2 waypoints" in done.out
@@ -132,24 +138,12 @@ def test_a_simulated_house_has_floors_pressure_and_satellites(stario, tmp_path):
     assert pressure == pytest.approx(np.ptp(height), abs=2.0)
 
 
-def test_simulate_replaces_a_recording_only_on_request(stario, tmp_path):
-    own = tmp_path / "own.csv"
-    own.write_text("own")
-    refused = stario("simulate", "own.csv", "--seconds", 5)
-    assert refused.code == 1
-    assert "--overwrite" in refused.err
-    assert own.read_text() == "own"
-    assert stario("simulate", "own.csv", "--seconds", 5, "--overwrite").code == 0
-    assert len(read_generic_csv(own)) == 1001
-
-
 def test_export_accepts_the_name_of_a_network(stario, tmp_path, monkeypatch):
     """Of its run; without one, StarIO is the default and others require training first."""
     pytest.importorskip("onnx")
     exported = []  # tracing others than StarIO takes seconds
-    monkeypatch.setattr(
-        "stario.network.runtime.export.export_onnx", lambda *given: exported.append(given)
-    )
+    export_onnx = "stario.network.runtime.export.export_onnx"
+    monkeypatch.setattr(export_onnx, lambda *given: exported.append(given))
     done = stario("export", "--model", "StarIO")
     assert (done.code, done.out) == (0, "StarIO.onnx\n")
     [(model, path)] = exported

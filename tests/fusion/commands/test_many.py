@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.fusion.commands import compare, options
+from stario.fusion.commands import options
 from stario.fusion.evaluation.compare import TRACKS
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
@@ -21,17 +21,11 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording):
     assert done.err == ""
     seen, *findings, files = done.out.splitlines()
     assert all(line.startswith(("! ", "  ")) for line in findings)
-    assert re.fullmatch(
-        r"walk: StarIO's track: [\d.]+ m rms from the truth \([\d.]+ % of its [\d.]+ m\), "
-        r"[\d.]+ m \([\d.]+ %\) after the best shift and turn; its sigma says [\d.]+ m; "
-        r"dead reckoning: [\d.]+ m",
-        seen,
-    )
+    assert re.fullmatch(r"walk: .* [\d.]+ m rms from the truth .*; dead reckoning: [\d.]+ m", seen)
     assert files.startswith("figures and tracks: out/walk/plan.png")
     assert "root mean square" not in done.out
-    assert {path.stem for path in Path("out/walk").glob("*.tum")} == {
-        *("track", "dead_reckoning", "truth"),
-    }
+    tracks = {path.stem for path in Path("out/walk").glob("*.tum")}
+    assert tracks == {"track", "dead_reckoning", "truth"}
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -79,7 +73,6 @@ def test_check_moments_reports_what_a_bad_moment_costs(stario, recording, monkey
     monkeypatch.setattr(simulated, lambda carry, seed: read_generic_csv(recording))
     shown = stario("check", "moments")
     assert "shake 10 s, middle" in shown.out
-    stario("check", "moments", "--axes", "y,-x,z").assert_one_line_error("--axes", "simulated")
 
 
 def test_check_fixes_evaluates_tracks_with_fixes(stario, recording):
@@ -141,18 +134,8 @@ def test_a_batch_continues_after_failures_and_reports_them(stario, recording, tm
 def test_evaluate_compares_with_other_weights_by_groups(stario, recording, tmp_path):
     """Weights against themselves; twelve seconds are too few for an error over ten seconds."""
     (tmp_path / "walks").mkdir()
-    stario(
-        "simulate",
-        "walks/long.csv",
-        "--seconds",
-        25,
-        "--carry",
-        "handheld",
-        "--rate",
-        100,
-        "--seed",
-        1,
-    )
+    options = "--seconds 25 --carry handheld --rate 100 --seed 1"
+    stario("simulate", "walks/long.csv", *options.split())
     done = stario(
         "evaluate", recording, "walks/long.csv", "--by", "set", "--against", "default",
         "--filtered", "--out", "out", "--json",
@@ -185,10 +168,9 @@ def test_check_fusion_compares_filter_and_graphs_on_simulated_walks(stario):
     assert {(one["recording"], one["group"]) for one in scores} == {("walk 0", "simulated")}
 
 
-def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):
-    loaded = []
-    monkeypatch.setattr("stario.fusion.evaluation.pedestrian.model_named", loaded.append)
-
-    compare._for_group("runs/{set}/{group}.safetensors", "ridi dan")
-
-    assert loaded == ["runs/ridi/ridi_dan.safetensors"]
+def test_weights_may_be_named_after_set_and_group(stario, recording, tmp_path):
+    (tmp_path / "ridi dan").mkdir()
+    (tmp_path / "ridi dan/walk.csv").write_bytes(recording.read_bytes())
+    named = "runs/{set}/{group}.safetensors"
+    done = stario("evaluate", "ridi dan/walk.csv", "--by", "set", "--against", named)
+    done.assert_one_line_error("runs/ridi/ridi_dan.safetensors")

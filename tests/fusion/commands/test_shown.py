@@ -17,9 +17,7 @@ from stario.sequences.readers.generic_csv import read_generic_csv
 TRACK_LABELS = ("dead reckoning (IMU alone)", "network alone", "StarIO", "truth")
 
 
-def test_run_writes_a_report_and_the_filters_track_on_request(
-    stario, recording, tmp_path, no_figures
-):
+def test_run_writes_a_report_and_the_filters_track(stario, recording, tmp_path, no_figures):
     done = stario("run", recording, "--out", "told", "--report", "--filtered", "--json")
     assert json.loads(done.out)["filtered"]["ate_m"] > 0.0
     times = [np.load(tmp_path / "told" / f"{name}.npz")["time"] for name in ("track", "filtered")]
@@ -31,9 +29,7 @@ def test_run_writes_a_report_and_the_filters_track_on_request(
     assert "in x and y only" in text
 
 
-def test_a_warning_is_shown_once_however_often_a_file_is_read(
-    stario, recording, tmp_path, monkeypatch
-):
+def test_a_warning_of_a_file_is_shown_once(stario, recording, tmp_path, monkeypatch):
     export("androsensor", tmp_path, read_generic_csv(recording))
     (file,) = tmp_path.glob("*AndroSensor.csv")
     file.write_text(file.read_text()[:-9])
@@ -43,9 +39,7 @@ def test_a_warning_is_shown_once_however_often_a_file_is_read(
     assert done.err.count("skipped the last row") == 1
 
 
-def test_compare_writes_a_report_of_what_is_known_next_to_the_tracks(
-    stario, recording, no_figures, tmp_path
-):
+def test_compare_writes_a_report_of_what_is_known(stario, recording, no_figures, tmp_path):
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     tracks = ("--report", "--tracks", "network")
     printed = stario("compare", recording, "--out", "told", *tracks, "--json").out
@@ -80,9 +74,7 @@ def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures
         ("uvicorn", ("live",)),
     ],
 )
-def test_a_missing_extra_is_reported_before_anything_is_computed(
-    stario, monkeypatch, package, arguments
-):
+def test_a_missing_extra_is_reported_first(stario, monkeypatch, package, arguments):
     monkeypatch.setitem(sys.modules, package, None)  # as if its extra were not installed
     stario(*arguments).assert_one_line_error(package, "not installed", "pip install")
 

@@ -45,9 +45,7 @@ def test_weights_that_train_writes_can_be_run(stario, recording, tmp_path, tiny)
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_training_continues_after_failures_and_caches_its_windows(
-    stario, recording, tmp_path, tiny
-):
+def test_training_continues_after_failures_and_caches(stario, recording, tmp_path, tiny):
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
     call = ("train", recording, "list.txt", "--generated", 1, "--config", tiny)
@@ -68,9 +66,7 @@ def test_training_continues_after_failures_and_caches_its_windows(
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_weights_to_start_from_set_the_network_and_its_calibration(
-    stario, recording, tmp_path, tiny, monkeypatch
-):
+def test_weights_to_start_from_set_the_network(stario, recording, tmp_path, tiny, monkeypatch):
     """A few seconds are too few to calibrate sigma anew."""
     other = "StarIO without MSGCU"
 
@@ -108,9 +104,7 @@ def test_a_recording_cannot_both_train_and_validate(stario, recording, tmp_path)
     assert not (tmp_path / "runs").exists()
 
 
-def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
-    stario, recording, tmp_path
-):
+def test_short_recordings_require_validation_recordings(stario, recording, tmp_path):
     write_csv(tmp_path / "short.csv", read_generic_csv(recording).slice(0.0, 9.0))
     stario("train", "short.csv", "--generated", 1).assert_one_line_error(
         "two legs between known positions", "--validation"
@@ -118,10 +112,12 @@ def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
 
 
 def test_what_is_left_out_is_neither_learned_from_nor_selected_on(tmp_path):
-    for line in _names():
-        file = split_name(tmp_path / line)[0]
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.touch()
+    listed = (Path(splits.__file__).parent / "all.txt").read_text().splitlines()
+    for line in listed:
+        if line and not line.startswith("#"):
+            file = split_name(tmp_path / line.partition(",")[0])[0]
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.touch()
     entries = read_packaged_list("all", tmp_path)
     groups = {entry.path: entry.group for entry in entries}
 
@@ -134,9 +130,3 @@ def test_what_is_left_out_is_neither_learned_from_nor_selected_on(tmp_path):
     assert not set(learned) & holdout
     left_out = sum(g.startswith("tyrex") or g == "ridi dan" for g in groups.values())
     assert len(learned) + len(selected) == len(entries) - left_out
-
-
-def _names() -> list[str]:
-    lists = Path(splits.__file__).parent / "all.txt"
-    lines = lists.read_text().splitlines()
-    return [line.partition(",")[0] for line in lines if line and not line.startswith("#")]

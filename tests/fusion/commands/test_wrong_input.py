@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stario.sequences import PositionTrack, write_csv
 from stario.sequences.readers.archive import write_archive
-from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.sequence import PositionTrack
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -62,6 +61,10 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
         (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
         (["convert", "RECORDING", "walk.txt"], [".txt", ".csv, .h5", "--to"]),
         (["live", "--port", "0", "--phyphox", "file:///etc/passwd"], ["phyphox"]),
+        (["run", "RECORDING", "--origin", "11.5"], ["--origin"]),
+        (["run", "RECORDING", "--origin", "here"], ["--origin"]),
+        (["run", "RECORDING", "--satellites", "yes"], ["--satellites"]),
+        (["run", "RECORDING", "--waypoints", "no"], ["--waypoints"]),
         (["run", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),
         (["live", "--out", "RECORDING"], ["found a file, expected a folder"]),
         (["train", "--start-from", "open", "--config", "no.json"], ["no.json: found no such"]),
@@ -104,6 +107,7 @@ def test_invalid_arguments_give_a_one_line_error(stario, recording, arguments, w
         ("check faults --no-magnetometer", "--no-magnetometer simulated"),
         ("check faults --axes y,-x,z", "--axes simulated"),
         ("check faults RECORDING --where person=dan", "--where one recording"),
+        ("check moments --axes y,-x,z", "--axes simulated"),
         ("check table --out cells --set a=. --sets oxiod", "--sets without --data"),
         ("run RECORDING --declination 5 --no-magnetometer", "--declination --no-magnetometer"),
         ("train RECORDING --recorded-only --generated 5", "--generated with --recorded-only"),
@@ -132,18 +136,24 @@ def test_an_invalid_setting_is_named_in_one_line(stario, recording, command, con
     stario(command, recording, "--config", "settings.json").assert_one_line_error(named)
 
 
-def test_no_file_is_overwritten_without_the_option(stario, recording, tmp_path):
-    before = recording.read_bytes()
-    stario("convert", recording, recording).assert_one_line_error("also an input", "another file")
-    stario("convert", recording, recording, "--overwrite").assert_one_line_error("also an input")
-    assert recording.read_bytes() == before
+@pytest.mark.parametrize("command", ["convert RECORDING", "simulate"])
+def test_no_file_is_overwritten_without_the_option(stario, recording, tmp_path, command):
     there = tmp_path / "there.csv"
     there.write_text("mine")
-    stario("convert", recording, there).assert_one_line_error("already exists", "--overwrite")
+    call = [recording if word == "RECORDING" else word for word in command.split()]
+    call += [there, *(["--seconds", 5] if command == "simulate" else [])]
+    stario(*call).assert_one_line_error("already exists", "--overwrite")
     assert there.read_text() == "mine"
-    assert stario("convert", recording, there, "--overwrite").code == 0
-    assert there.read_text() != "mine"
-    assert stario("convert", recording, there, "two.h5").code == 0
+    assert stario(*call, "--overwrite").code == 0
+    assert len(read_generic_csv(there)) > 1000
+
+
+def test_no_input_is_overwritten(stario, recording):
+    before = recording.read_bytes()
+    for options in ([], ["--overwrite"]):
+        stario("convert", recording, recording, *options).assert_one_line_error("also an input")
+    assert recording.read_bytes() == before
+    assert stario("convert", recording, "two.h5").code == 0
     before = Path("two.h5").read_bytes()
     for source in ("two.h5:walk", "."):
         stario("convert", source, "two.h5", "--overwrite").assert_one_line_error("also an input")
@@ -159,9 +169,7 @@ def test_a_declination_without_a_source_of_north_is_reported(stario, recording):
 
 
 @pytest.mark.parametrize(("command", "where"), [("train", "all.h5"), ("evaluate", "list.txt")])
-def test_a_missing_package_ends_a_batch_instead_of_leaving_out_recordings(
-    stario, recording, tmp_path, monkeypatch, command, where
-):
+def test_a_missing_package_ends_a_batch(stario, recording, tmp_path, monkeypatch, command, where):
     write_archive(tmp_path / "all.h5", [read_generic_csv(recording)])
     (tmp_path / "list.txt").write_text("all.h5:walk\n")
     monkeypatch.setitem(sys.modules, "h5py", None)

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,16 +15,12 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.displacement_error import (
-    _AtTicks,
-    _interpolated,
-    _stretches,
     known_truth,
     recording_errors,
     usable_streams,
 )
 from stario.fusion.evaluation.groups import (
     RATIOS,
-    Benchmark,
     alone_on,
     benchmark,
     groups_figure,
@@ -36,26 +32,23 @@ from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, 
 from stario.fusion.evaluation.scores import POOLED, values
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.readers import read_recording
-from stario.sequences.sequence import ImuSequence, PositionTrack, is_gap
+from stario.sequences.sequence import ImuSequence, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 streams_of = cache(usable_streams)
 
 
+def with_known(walk: ImuSequence, time: np.ndarray, kind="positions", jump=0.0) -> ImuSequence:
+    """The walk with positions at these times instead of poses, which jump after 40 s."""
+    position_W = walk.truth.at(time).position_W + np.where(time > 40.0, jump, 0.0)[:, None]
+    known = position_W[:, :2] if kind == "waypoints" else position_W
+    return replace(walk, truth=None, positions=PositionTrack(time, known, kind))
+
+
 def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
-    truth = walk.truth
-    time = np.arange(1.0, 70.0, every)
-    xy = truth.at(time).position_W[:, :2]
-    return replace(walk, truth=None, positions=PositionTrack(time, xy, "waypoints"))
-
-
-def yaw_WN(walk: ImuSequence, stream: LevelledStream) -> np.ndarray:
-    """Yaw (K,) that rotates N to the true world at each tick."""
-    attitude_WB = walk.truth.at(stream.ticks).attitude_WB
-    return yaw_of(attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
+    return with_known(walk, np.arange(1.0, 70.0, every), "waypoints")
 
 
 class Stub:
@@ -64,7 +57,9 @@ class Stub:
     def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
         [stream] = streams_of(walk)
         known = walk.truth.at(stream.ticks).position_W[:, :2] @ [1.0, 1j]
-        steps = np.exp(-1j * yaw_WN(walk, stream)[:-2]) * (known[2:] - known[:-2])
+        R_NB = Rotation.from_matrix(stream.R_NB)
+        attitude_WN = walk.truth.at(stream.ticks).attitude_WB * R_NB.inv()
+        steps = np.exp(-1j * yaw_of(attitude_WN)[:-2]) * (known[2:] - known[:-2])
         steps = scale * np.exp(1j * yaw) * steps[: stream.window_count]
         steps = np.pad(steps, (0, stream.window_count - len(steps)), "edge")
         steps = np.exp(-1j * stream.headings) * steps  # in the windows' frames
@@ -99,15 +94,6 @@ def walk():
 def stepping():
     """A person's walk, whose steps can be seen."""
     return simulate_imu(generate_walk(9, 75.0), 100.0, PERFECT_IMU, 3, name="steps")
-
-
-ARCHIVES = DATA / "archives"
-
-
-def with_positions(walk: ImuSequence, jump: float = 0.0) -> ImuSequence:
-    truth = walk.truth
-    position_W = truth.position_W + np.where(truth.time > 40.0, jump, 0.0)[:, None]
-    return replace(walk, truth=None, positions=PositionTrack(truth.time, position_W, "positions"))
 
 
 def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk):
@@ -146,20 +132,23 @@ def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate
     assert turned["rms_1s_m"] > 0.3
 
 
-def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_a_jump(walk):
-    smooth, all_blocks = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
-    jumped, blocks = errors_of(with_positions(walk, jump=9.0), Stub(walk, 0.9, yaw=2.0))
-    time = np.arange(1.0, 74.0)
-    at_1_hz = PositionTrack(time, walk.truth.at(time).position_W, "positions")
-    slow, _ = errors_of(replace(walk, truth=None, positions=at_1_hz), Stub(walk, 0.9, yaw=2.0))
-    assert slow["rms_10s_m"] == pytest.approx(smooth["rms_10s_m"], rel=0.05)
-    for found in (smooth, jumped, slow):
+def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_jumps_and_gaps(walk):
+    time = walk.truth.time
+    slow, gone = np.arange(1.0, 74.0), (time < 5.0) | ((time > 35.0) & (time < 45.0))
+    (smooth, all_of_them), (jumped, after_jump), (gapped, after_gap), (at_1_hz, _) = (
+        errors_of(with_known(walk, at, jump=jump), Stub(walk, 0.9, yaw=2.0))
+        for at, jump in ((time, 0.0), (time, 9.0), (time[~gone], 0.0), (slow, 0.0))
+    )
+    for found, rel in ((smooth, 1e-9), (jumped, 0.3), (gapped, 0.3), (at_1_hz, 0.05)):
         assert found["length_ratio"] == pytest.approx(0.9, abs=0.02)
+        assert found["rms_10s_m"] == pytest.approx(smooth["rms_10s_m"], rel=rel)
         assert found["stretch_percent"] < 5.0
         assert np.isnan(found["ate_fit_m"])
-    assert jumped["rms_10s_m"] == pytest.approx(smooth["rms_10s_m"], rel=0.3)
-    fewer, all_of_them = (b.groupby("metric")["count"].sum() for b in (blocks, all_blocks))
-    assert fewer["rms_10s_m"] < all_of_them["rms_10s_m"]
+    all_blocks = all_of_them, after_jump, after_gap
+    counts = (blocks.groupby("metric")["count"].sum() for blocks in all_blocks)
+    whole, *fewer = (count["rms_10s_m"] for count in counts)
+    assert max(fewer) < whole
+    assert fewer[1] < whole - 2 * 15  # no window of 10 s in 15 s, two a second
 
 
 def test_with_waypoints_yaw_and_position_are_fitted_first(walk):
@@ -178,21 +167,7 @@ def test_with_waypoints_yaw_and_position_are_fitted_first(walk):
     assert np.sqrt(total / count) == pytest.approx(short["ate_fit_m"])
 
 
-def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk):
-    whole = with_positions(walk).positions
-    time = whole.time
-    known = ((time > 5.0) & (time < 20.0)) | ((time > 30.0) & (time < 70.0))
-    ticks = np.arange(0.0, 75.0, 0.5)
-    track = PositionTrack(time[known], whole.position_W[known], "positions")
-    position, breaks = _interpolated(ticks, track, is_gap(np.diff(track.time)))
-    inside = ((ticks > 5.1) & (ticks < 19.9)) | ((ticks > 30.1) & (ticks < 69.9))
-    outside = (ticks < 4.9) | ((ticks > 20.1) & (ticks < 29.9)) | (ticks > 70.1)
-    assert np.isfinite(position[inside]).all()
-    assert np.isnan(position[outside]).all()
-    assert len(set(breaks[(ticks > 5.1) & (ticks < 69.9)])) == 2  # before and after the gap
-
-
-@pytest.mark.skipif(not ARCHIVES.exists(), reason=f"no recordings at {ARCHIVES}")
+@pytest.mark.skipif(not DATA.exists(), reason=f"no recordings at {DATA}")
 @pytest.mark.parametrize(
     ("name", "kind", "path_m", "error"),
     [
@@ -202,7 +177,7 @@ def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk):
     ],
 )
 def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(name, kind, path_m, error):
-    recording = read_recording(Path(f"{ARCHIVES}/{name}"))
+    recording = read_recording(Path(f"{DATA}/archives/{name}"))
     found, _ = errors_of(recording, PedestrianDeadReckoning())
     assert known_truth(recording)[0] == kind
     assert found["path_m"] == pytest.approx(path_m, rel=0.05)
@@ -227,35 +202,12 @@ def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(stepping):
     assert found["ate_fit_percent"] == pytest.approx(share, rel=0.1)
 
 
-def test_stretches_at_rest_have_no_error_relative_to_their_path():
-    rng = np.random.default_rng(0)
-    track, truth = (0.01 * (rng.normal(size=100) + 1j * rng.normal(size=100)) for _ in range(2))
-    breaks = np.zeros(100, dtype=np.int64)
-    assert list(_stretches(_AtTicks(track, truth, breaks))) == []
-    assert len(list(_stretches(_AtTicks(track, truth + np.arange(100.0), breaks)))) == 3
-
-
-Makers = dict[str, Callable[[str], Any]]
-"""By the name of the weights, a function that makes the network for a group."""
-
-
-def judged(
-    recordings: Mapping[str, ImuSequence],
-    models: Makers,
-    by: str = "set",
-    groups: Mapping[str, str] | None = None,
-) -> Benchmark:
-    paths = {Path(name): (groups or {}).get(name, "") for name in recordings}
-    found = [
-        alone_on(
-            recordings[str(path)],
-            path,
-            group,
-            lambda name, group: models[name](group),
-            models,
-        )
-        for path, group in paths.items()
-    ]
+def judged(recordings: Mapping[str, ImuSequence], models: dict[str, Any], by="set", groups=None):
+    """Compare networks that functions make for a group, by the name of the weights."""
+    found = []
+    for name, recording in recordings.items():
+        path, group = Path(name), (groups or {}).get(name, "")
+        found.append(alone_on(recording, path, group, lambda name, g: models[name](g), models))
     return benchmark(found, by, *models)
 
 
@@ -267,10 +219,7 @@ def of_person(recording: ImuSequence, person: str) -> ImuSequence:
 def pair(walk):
     recordings = {"one": of_person(walk, "a"), "two": of_person(with_waypoints(walk), "b")}
     scales = {"walks a": 0.95, "walks b": 0.9}
-    models = {
-        "ours": lambda group: Stub(walk, scales[group]),
-        "theirs": lambda group: Stub(walk, 0.8),
-    }
+    models = {"ours": lambda name: Stub(walk, scales[name]), "theirs": lambda _: Stub(walk, 0.8)}
     return judged(recordings, models, "person", {"one": "walks a", "two": "walks b"})
 
 
@@ -288,24 +237,39 @@ def test_a_recording_with_two_waypoints_is_named_as_not_compared(walk, caplog):
     few, enough = with_waypoints(walk, 50.0), with_waypoints(walk)
     models = {"ours": lambda group: Stub(walk)}
     found = judged({"50": few, "8": enough}, models)
-    assert [record.getMessage()[:17] for record in caplog.records] == ["50: not compared,"]
+    [alone] = caplog.messages
+    assert alone.startswith("50: not compared")
     assert (values(found.scores, "path_m") > 0.0).tolist() == [False, True]
     caplog.clear()
     judged({"50": few, "third": few}, models)
-    [record] = caplog.records
-    assert record.getMessage().startswith("2 of 2 recordings, the first 50: not compared,")
+    [both] = caplog.messages
+    assert both.startswith("2 of 2 recordings, the first 50")
 
 
-def test_a_device_at_rest_counts_in_no_median_or_ratio(walk, caplog):
+@pytest.mark.parametrize("kind", ["poses", "positions"])
+def test_a_device_at_rest_counts_in_no_median_or_ratio(walk, caplog, kind):
     """Its errors relative to its path, the noise of its truth, would be a thousand percent."""
     still = 1e-4 * np.random.default_rng(0).normal(size=walk.truth.position_W.shape)
     resting = replace(walk, name="rest", truth=replace(walk.truth, position_W=still))
+    if kind == "positions":
+        resting = with_known(resting, walk.truth.time)
+
     models = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
     found, walking = judged({"walk": walk, "rest": resting}, models), judged({"walk": walk}, models)
-    assert "rest: not compared, because the ground truth moves by less" in caplog.text
+    assert "rest: not compared" in caplog.text
     both, alone = (part.rows.iloc[-1] for part in (found, walking))
     assert str(both) == str(alone)  # some are NaN
     assert both["recordings"] == 1
+
+
+def test_stretches_at_rest_have_no_error_relative_to_their_path(walk):
+    """After half a minute the truth is but noise: errors would be half of its path."""
+    late, position_W = walk.truth.time > 30.0, walk.truth.position_W.copy()
+    noise = 1e-4 * np.random.default_rng(0).normal(size=(late.sum(), 3))
+    position_W[late] = position_W[late][0] + noise
+    halting = replace(walk, truth=replace(walk.truth, position_W=position_W))
+    found, _ = errors_of(with_known(halting, walk.truth.time), Stub(halting, 0.9))
+    assert 1.0 < found["stretch_percent"] < 5.0
 
 
 def test_rows_compare_weights_by_group_and_pooled(walk, pair):
@@ -325,10 +289,7 @@ def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(walk)
     scales = {"r.h5:1": ("a", 0.95), "r.h5:2": ("b", 0.9), "r.h5:3": ("b", 0.9)}
     recordings = {name: of_person(walk, person) for name, (person, _) in scales.items()}
     by_group = {f"r {person}": scale for person, scale in scales.values()}
-    models = {
-        "ours": lambda group: Stub(walk, by_group[group]),
-        "theirs": lambda group: Stub(walk, 0.8),
-    }
+    models = {"ours": lambda name: Stub(walk, by_group[name]), "theirs": lambda _: Stub(walk, 0.8)}
     pooled = judged(recordings, models, "person").rows.iloc[-1]
     # Persons have equal weights.
     assert pooled["ratio_1s"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), rel=0.01)

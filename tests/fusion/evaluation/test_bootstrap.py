@@ -84,11 +84,8 @@ def test_a_few_blocks_have_no_interval():
     assert np.isnan([few.low, few.high, two_walks.low, two_walks.high]).all()
 
 
-BETTER, WORSE, MUCH_WORSE = (
-    Interval(0.8, 0.7, 0.9),
-    Interval(1.09, 0.9, 1.3),
-    Interval(1.11, 0.9, 1.3),
-)
+BETTER = Interval(0.8, 0.7, 0.9)
+WORSE, MUCH_WORSE = Interval(1.09, 0.9, 1.3), Interval(1.11, 0.9, 1.3)
 
 
 @pytest.mark.parametrize(

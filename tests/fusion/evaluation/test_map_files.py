@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.evaluation.known_positions import fitted_georeference
 from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
 from stario.fusion.values.state import Track
-from stario.sequences.geodesy import Georeference
-from stario.sequences.sequence import PositionTrack, Trajectory
+from stario.sequences import Georeference, PositionTrack, Trajectory
 
 PLACE = Georeference(48.1, 11.5, altitude_m=520.0)
 

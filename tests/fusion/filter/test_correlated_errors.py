@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from initial_ekf import Driven
+from support import nav_state, stream
 
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.filter import estimator, map_frame
@@ -26,11 +27,7 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.recording import cut_recording
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.fixes import position_fix
-from stario.fusion.values.state import NavState
-from stario.sequences.accuracy.metrics import evaluate_track
-from stario.sequences.attitude.rotations import about_z
-from stario.sequences.noise import ImuNoise
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences import STANDARD_GRAVITY, ImuNoise, about_z, evaluate_track
 
 F = FilterConfig()
 SPEED = 1.2
@@ -39,9 +36,6 @@ SPEED = 1.2
 
 def config(correlated: bool) -> NavigatorConfig:
     return NavigatorConfig(filter=replace(F, correlated_errors=correlated))
-
-
-# --- the model -----------------------------------------------------------------------------------
 
 
 def test_shares_add_up_along_a_displacement_and_vanish_with_the_level():
@@ -67,10 +61,8 @@ def test_the_floors_slope_is_no_error_of_the_network():
 def test_a_second_of_white_errors_is_the_same_at_any_update_rate():
     """More windows a second repeat each other's errors instead of averaging them."""
     d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
-    slow, fast = (
-        displacement_errors(d_W, covariance, 1.0, FilterConfig(update_rate=rate))
-        for rate in (2, 10)
-    )
+    configs = (FilterConfig(update_rate=rate) for rate in (2, 10))
+    slow, fast = (displacement_errors(d_W, covariance, 1.0, each) for each in configs)
     np.testing.assert_allclose(fast.white / 10.0, slow.white / 2.0)
     np.testing.assert_allclose(fast.considered, slow.considered)
 
@@ -123,15 +115,11 @@ def test_a_network_that_claims_a_fifth_of_its_sigma_costs_little(make_walk, make
     assert nis < 10.0  # 32 at a level of at most 5
 
 
-# --- the covariance ------------------------------------------------------------------------------
-
-
 def straight_walk(rng: np.random.Generator, seconds: int) -> tuple[Driven, np.ndarray, float]:
     """Walk straight with errors as the model has them; return filter, true end and mean NIS."""
-    ekf = Driven(slots=1)
-    zero = np.zeros(3)
+    ekf, zero = Driven(slots=1), np.zeros(3)
     P = np.diag(np.repeat([1e-6, 1e-2, 1e-6, 1e-12, 1e-6], 3))
-    ekf.initialise(NavState(0.0, np.eye(3), np.array([SPEED, 0.0, 0.0]), zero, zero, zero, P))
+    ekf.initialise(nav_state(P, v_W=np.array([SPEED, 0.0, 0.0])))
     noise = ImuNoise(gyro_noise=1e-5, accel_noise=0.1)
     time = np.arange(0.0, 1.0 + 1e-9, 0.1)
     accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
@@ -186,9 +174,8 @@ def test_the_track_does_not_depend_on_them(walk, oracle, track):
     assumed_white = Navigator(oracle, config(False)).run(walk)
     pairs = (assumed_white, track), (assumed_white.filtered, track.filtered)
     for white, correlated in pairs:
-        np.testing.assert_allclose(
-            white.trajectory.position_W, correlated.trajectory.position_W, rtol=0.0, atol=1e-9
-        )
+        ours, theirs = (each.trajectory.position_W for each in (correlated, white))
+        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-9)
         assert not np.allclose(white.covariance, correlated.covariance)
 
 
@@ -196,10 +183,7 @@ def test_the_track_does_not_depend_on_them(walk, oracle, track):
 def test_a_stream_gives_the_covariances_of_its_filter(walk, oracle, track, backend):
     recording = track.filtered
     navigator = Navigator(oracle, config(True), backend=backend)
-    short = walk.slice(0.0, 12.0)
-    samples = zip(short.time, short.gyro, short.accel, strict=True)
-    states = [state for sample in samples if (state := navigator.push(*sample)) is not None]
-    for state in states[20::20]:
+    for state in stream(navigator, walk.slice(0.0, 12.0))[20::20]:
         k = int(np.argmin(np.abs(recording.time - state.time)))
         expected = np.sqrt(np.diag(recording.covariance[k])[6:8])
         found = np.sqrt(np.diag(state.position_covariance)[:2])
@@ -208,10 +192,8 @@ def test_a_stream_gives_the_covariances_of_its_filter(walk, oracle, track, backe
 
 def test_a_position_fix_removes_them(walk, oracle):
     truth = walk.truth.at(np.array([2.0, 13.0, 22.0]))
-    fixes = [
-        position_fix(t, p, 1e-4 * np.eye(3))
-        for t, p in zip(truth.time, truth.position_W, strict=True)
-    ]
+    known = zip(truth.time, truth.position_W, strict=True)
+    fixes = [position_fix(t, p, 1e-4 * np.eye(3)) for t, p in known]
     track = Navigator(oracle, config(True), backend="ekf").run(walk, fixes=fixes)
     variance = np.trace(track.covariance[:, 6:8, 6:8], axis1=1, axis2=2)
     before, after = np.searchsorted(track.time, (21.85, 22.05))
@@ -221,10 +203,8 @@ def test_a_position_fix_removes_them(walk, oracle):
 
 def test_the_first_fix_after_a_straight_walk_is_believed():
     """A lasting error moves the end of a straight walk by many sigmas of white errors."""
-    ekf = Driven(slots=2)
-    zero = np.zeros(3)
-    P = np.diag(np.repeat([1e-4, 1e-2, 1e-4, 1e-8, 1e-4], 3))
-    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, P))
+    ekf, zero = Driven(slots=2), np.zeros(3)
+    ekf.initialise(nav_state(np.diag(np.repeat([1e-4, 1e-2, 1e-4, 1e-8, 1e-4], 3))))
     rng, length, scale = np.random.default_rng(0), 1.2, 1.03
     time = np.arange(0.0, 1.0 + 1e-9, 0.1)
     accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
@@ -248,11 +228,10 @@ def test_the_first_fix_after_a_straight_walk_is_believed():
     assert np.linalg.norm(after.p_W - truth) < 1.0
 
 
-def test_a_gap_is_as_uncertain_as_the_gains_assume(walk):
+def test_a_gap_is_as_uncertain_as_the_gains_assume(walk, without):
     """Elsewhere the accelerometer is better than they assume."""
-    kept = (walk.time < 10.0) | (walk.time > 12.0)
-    samples = (each[kept] for each in (walk.time, walk.gyro, walk.accel))
-    intervals, front_end = cut_recording(ImuSequence("gap", *samples), config(True))
+    holed = without(walk, (walk.time >= 10.0) & (walk.time <= 12.0))
+    intervals, front_end = cut_recording(holed, config(True))
     state = estimator.begin(config(True), front_end.start)
     added = {}  # by the first interval of its kind, before biases matter
     for interval in intervals:
@@ -277,9 +256,6 @@ def test_no_measurement_estimates_them():
         assert not ekf.P[rows].any()
 
 
-# --- the graph's covariance ----------------------------------------------------------------------
-
-
 def random_covariance(rng: np.random.Generator) -> np.ndarray:
     root = rng.normal(size=(15, 15))
     return root @ root.T + np.eye(15)
@@ -289,11 +265,6 @@ def estimate(P: np.ndarray, Q: np.ndarray) -> Estimate:
     zero = np.zeros(3)
     X = np.eye(3, 5)  # at the origin and at rest: plain errors equal invariant ones
     return Estimate(0.0, X, zero, zero, zero, np.stack([P, Q]))
-
-
-def nav_state(covariance: np.ndarray) -> NavState:
-    zero = np.zeros(3)
-    return NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
 
 
 def test_a_graph_in_a_turned_frame_gets_the_filters_covariance_turned():

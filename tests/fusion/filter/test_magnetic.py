@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from initial_ekf import Driven
+from scipy.spatial.transform import Rotation
 from support import GRAPH as CONFIG
-from support import stream, stream_deviation
+from support import nav_state, stream, stream_deviation
 from told import health_lines
 
-from stario.fusion import Navigator, NavState, PriorPose
+from stario.fusion import Navigator, PriorPose, position_fix
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import (
@@ -22,11 +23,8 @@ from stario.fusion.filter.magnetic import (
     update_bearing,
     with_field,
 )
-from stario.fusion.values.config import FilterConfig
-from stario.fusion.values.fixes import position_fix
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.magnetometer import MagneticField
@@ -65,22 +63,16 @@ def biased_track(biased_walk, oracle):
 
 
 def state() -> EkfState:
-    ekf = Driven(2)
-    zero = np.zeros(3)
-    R_WB = exp_so3(np.array([0.3, -0.5, 1.2]))
-    p_W = np.array([3.0, 1.0, 0.0])
-    ekf.initialise(NavState(0.0, R_WB, zero, p_W, zero, zero, 0.01 * np.eye(15)))
+    ekf, R_WB = Driven(2), exp_so3(np.array([0.3, -0.5, 1.2]))
+    ekf.initialise(nav_state(0.01 * np.eye(15), R_WB=R_WB, p_W=np.array([3.0, 1.0, 0.0])))
     return with_field(ekf.state, R_WB.T @ FIELD_W)
 
 
 def test_a_field_that_varies_along_the_path_has_a_wandering_azimuth() -> None:
     rng = np.random.default_rng(1)
     wander = {}
-    for place, spread, travelled in (
-        ("quiet", 0.01, True),
-        ("steel", 0.4, True),
-        ("table", 0.01, False),
-    ):
+    places = ("quiet", 0.01, True), ("steel", 0.4, True), ("table", 0.01, False)
+    for place, spread, travelled in places:
         reference = MagneticReference()
         for k in range(120):
             size, dip = 45.0 * (1.0 + spread * rng.normal()), 1.0 + spread * rng.normal()
@@ -89,13 +81,6 @@ def test_a_field_that_varies_along_the_path_has_a_wandering_azimuth() -> None:
     assert wander["quiet"] < 0.15
     # One spot tells nothing of others.
     assert wander["steel"] == wander["table"] == DISTURBANCE_SIGMA
-
-
-def with_iron(s: EkfState, iron_B: np.ndarray, sigma: float):
-    """The state with a known hard iron [uT]."""
-    P, rows = s.covariances.copy(), slice(s.field_row + 2, s.field_row + 5)
-    P[:, rows, rows] = sigma**2 * np.eye(3)
-    return replace(s, covariances=P, field=replace(s.field, hard_iron_B=iron_B))
 
 
 def test_bearing_jacobian_agrees_with_finite_differences():
@@ -119,9 +104,8 @@ def test_a_turned_frame_turns_the_azimuth():
     before = state()
     turned = before.transformed(exp_so3(np.array([0.0, 0.0, 0.7])), np.array([5.0, 0.0, 0.0]))
     assert turned.field.azimuth - before.field.azimuth == pytest.approx(0.7)
-    np.testing.assert_allclose(
-        turned.R_WB @ before.R_WB.T @ FIELD_W, exp_so3(np.array([0.0, 0.0, 0.7])) @ FIELD_W
-    )
+    turn = exp_so3(np.array([0.0, 0.0, 0.7]))
+    np.testing.assert_allclose(turned.R_WB @ before.R_WB.T @ FIELD_W, turn @ FIELD_W)
 
 
 def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown():
@@ -134,19 +118,22 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown():
     assert ekf.state.P[2, 2] > 0.99 * yaw_variance
 
 
-def test_a_field_of_unusual_size_has_less_weight():
-    reference = MagneticReference()
+def weight_left(reference: MagneticReference, scale: float = 1.0) -> float:
+    """Variance of what is unknown of the field after a bearing 0.2 rad off."""
+    s = state()
+    m_B = exp_so3(np.array([0.0, 0.0, 0.2])) @ s.R_WB.T @ FIELD_W * scale
+    s, *_ = update_bearing(s, reference, m_B)
+    return float(np.trace(s.P[27:, 27:]))
+
+
+def test_a_field_of_unusual_size_or_that_the_device_carries_on_has_less_weight():
+    reference, size = MagneticReference(), float(np.linalg.norm(FIELD_W))
+    carried = weight_left(MagneticReference(measured=size))
+    assert carried > weight_left(MagneticReference(measured=0.0)) + 0.1
     for k in range(20):
         reference = reference.updated(0.5 * k, 45.0, 1.0, travelled=True)
-    gains = []
-    for scale in (1.0, 1.5):
-        ekf = Driven(2)
-        ekf.state = state()
-        m_B = exp_so3(np.array([0.0, 0.0, 0.2])) @ ekf.state.R_WB.T @ FIELD_W * scale
-        usual = replace(reference, size=float(np.linalg.norm(FIELD_W)))
-        ekf.state, *_ = update_bearing(ekf.state, usual, m_B)
-        gains.append(float(np.trace(ekf.state.P[27:, 27:])))
-    assert gains[1] > gains[0]
+    usual = replace(reference, size=size)
+    assert weight_left(usual, scale=1.5) > weight_left(usual)
 
 
 def test_a_field_that_the_device_carries_on_tells_nothing_of_the_place():
@@ -164,15 +151,6 @@ def test_a_field_that_the_device_carries_on_tells_nothing_of_the_place():
     assert wander[0] < 0.3 < wander[1]
 
 
-def test_a_field_that_the_device_carries_on_has_less_weight():
-    remaining = []
-    for last in (0.0, float(np.linalg.norm(FIELD_W))):
-        s = state()
-        s, *_ = update_bearing(s, MagneticReference(measured=last), s.R_WB.T @ FIELD_W)
-        remaining.append(float(np.trace(s.P[27:, 27:])))
-    assert remaining[1] > remaining[0] + 0.1
-
-
 @pytest.mark.slow
 def test_the_bias_is_consistent_in_a_quiet_and_in_a_disturbed_field(make_oracle):
     walk = generate_walk(3, 50.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4)))
@@ -186,14 +164,6 @@ def test_the_bias_is_consistent_in_a_quiet_and_in_a_disturbed_field(make_oracle)
         assert abs(track.b_g[-1, 2] - 0.006) < 3.0 * sigma
 
 
-def last_yaw_error(states: list[NavState], sequence: ImuSequence) -> float:
-    ends = []
-    for s in (states[0], states[-1]):
-        R = s.R_WB @ sequence.truth.at(np.array([s.time])).attitude_WB.as_matrix()[0].T
-        ends.append(math.atan2(R[1, 0], R[0, 0]))
-    return abs(math.remainder(ends[1] - ends[0], 2.0 * math.pi))
-
-
 def test_bearings_determine_the_gyroscope_bias(biased_walk, oracle, biased_track):
     """In a stream as in a batch; without it the error of the bias is larger."""
     track = biased_track
@@ -205,38 +175,25 @@ def test_bearings_determine_the_gyroscope_bias(biased_walk, oracle, biased_track
 
     states = stream(Navigator(oracle, CONFIG), biased_walk.slice(0.0, 16.0))
     assert stream_deviation(states, track) < 1e-6
-    assert last_yaw_error(states, biased_walk) < math.radians(20.0)
+    ends = states[0], states[-1]
+    true = biased_walk.truth.at(np.array([s.time for s in ends])).attitude_WB
+    turned = yaw_of(Rotation.from_matrix([s.R_WB for s in ends]) * true.inv())
+    assert abs(math.remainder(turned[1] - turned[0], 2.0 * math.pi)) < math.radians(20.0)
 
 
 def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
-    known = with_iron(state(), np.array([20.0, -25.0, 10.0]), sigma=1.0)
+    s = state()
+    P, row = s.covariances.copy(), s.field_row + 2
+    P[:, row : row + 3, row : row + 3] = np.eye(3)
+    field = replace(s.field, hard_iron_B=np.array([20.0, -25.0, 10.0]))
+    known = replace(s, covariances=P, field=field)
     later = propagated_field(known, 3.0 * HARD_IRON_SECONDS, DISTURBANCE_SIGMA)
-    row = later.field_row + 2
     assert np.abs(later.field.hard_iron_B).max() < 2.0
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
 
 
-@pytest.mark.slow
-def test_a_streams_graph_estimates_the_same_bias_as_its_filter(biased_walk, make_oracle):
-    config = replace(CONFIG, filter=replace(CONFIG.filter, gyro_bias_sigma=1e-2))
-    walk = biased_walk.slice(0.0, 42.0)
-    oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
-    graph = stream(Navigator(oracle, config, backend="graph"), walk)[-1]
-    filtered, without_field = (
-        Navigator(oracle, config, backend="ekf").run(replace(walk, magnetometer=field))
-        for field in (walk.magnetometer, None)
-    )
-    ours = math.sqrt(graph.covariance[11, 11])
-    theirs, blind = (math.sqrt(t.covariance[-1, 11, 11]) for t in (filtered, without_field))
-    assert abs(graph.b_g[2] - filtered.b_g[-1, 2]) < 0.2 * theirs
-    assert ours == pytest.approx(theirs, rel=0.1)
-    assert blind > 1.1 * theirs
-
-
 @pytest.mark.parametrize("fault", ["axes swapped", "stopped"])
-def test_a_field_that_contradicts_the_gyroscope_does_not_turn_the_track(
-    biased_walk, oracle, biased_track, fault
-):
+def test_a_contradicting_field_turns_no_track(biased_walk, oracle, biased_track, fault):
     field, time = biased_walk.magnetometer.field.copy(), biased_walk.magnetometer.time
     if fault == "axes swapped":
         field = field[:, [1, 0, 2]]
@@ -264,9 +221,7 @@ def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model):
 def test_a_field_on_another_clock_is_reported(biased_walk, still_model):
     walk = biased_walk.slice(0.0, 6.0)
     field = replace(walk.magnetometer, time=walk.magnetometer.time + 1e4)
-    health = (
-        Navigator(still_model, CONFIG, backend="ekf").run(replace(walk, magnetometer=field)).health
-    )
+    health = Navigator(still_model, CONFIG).run(replace(walk, magnetometer=field)).health
     assert health.fields_dropped == len(field.time) > 50
     assert any("magnetic fields were dropped" in line for line in health_lines(health))
 
@@ -279,12 +234,9 @@ def test_a_field_in_another_unit_is_named_as_such(biased_walk, make_oracle, scal
     walk = biased_walk.slice(0.0, 6.0)
     field = replace(walk.magnetometer, field=scale * walk.magnetometer.field)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-    bearings = (
-        Navigator(oracle, CONFIG, backend="ekf")
-        .run(replace(walk, magnetometer=field))
-        .health.bearings
-    )
-    assert set(bearings) == {f"too {named} to be in uT"}
+    track = Navigator(oracle, CONFIG, backend="ekf").run(replace(walk, magnetometer=field))
+    [reason] = track.health.bearings
+    assert named in reason
 
 
 def test_a_disabled_magnetometer_has_no_effect(biased_walk, make_oracle):
@@ -316,9 +268,7 @@ def test_a_declination_turns_the_track_to_true_north(biased_walk, make_oracle):
     assert abs(yaw_of(before.trajectory.attitude_WB)[0]) < 0.02  # first yaw without a declination
 
 
-def test_the_field_does_not_tell_after_a_gap_a_yaw_that_was_unknown_before(
-    biased_walk, make_oracle, without
-):
+def test_the_field_tells_no_unknown_yaw_after_a_gap(biased_walk, make_oracle, without):
     whole = biased_walk.slice(0.0, 20.0)
     walk = without(whole, (whole.time > 10.0) & (whole.time < 14.0))
     oracle = make_oracle(walk, biased_walk.truth, CONFIG)
@@ -334,9 +284,3 @@ def test_north_is_not_applied_if_the_direction_is_known(biased_walk, make_oracle
     known = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3))
     track = Navigator(oracle, settings, prior=known, backend="ekf").run(walk)
     assert track.health.fixes == {}
-
-
-@pytest.mark.parametrize("declination", [4.0, math.nan, "east"])
-def test_a_declination_that_is_not_an_angle_is_refused(declination):
-    with pytest.raises(ConfigError, match="declination"):
-        FilterConfig(declination=declination)

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 from simulated import measured
 from support import GRAPH as CONFIG
-from support import stream
+from support import Altered, lying, stream
 
-from stario.fusion import Navigator, NavState, PriorPose
+from stario.fusion import Fix, Navigator, NavState, PriorPose, position_fix, yaw_fix
 from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.planar_alignment import PlanarAlignment
-from stario.fusion.values.fixes import Fix, position_fix, yaw_fix
 from stario.fusion.values.lie import yaw_twist
+from stario.sequences import ImuSequence, about_z, yaw_of
 from stario.sequences.accuracy.metrics import pose_errors
-from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.sequence import ImuSequence
 
 BACKENDS = ("ekf", "graph")
 MAP = np.array([5.0e5, 4.5e6, 120.0])
@@ -29,10 +27,11 @@ def true_at(walk: ImuSequence, time: float) -> np.ndarray:
 def fixes_of(walk: ImuSequence, times: Any, shift: np.ndarray) -> list[Fix]:
     """Positions with a sigma of 0.3 m in a map frame that is turned and shifted."""
     rng, turn, covariance = np.random.default_rng(1), about_z(2.0), 0.09 * np.eye(3)
-    return [
-        position_fix(t, turn.apply(true_at(walk, t)) + rng.normal(0.0, 0.3, 3) + shift, covariance)
-        for t in times
-    ]
+    fixes = []
+    for t in times:
+        place = turn.apply(true_at(walk, t)) + rng.normal(0.0, 0.3, 3) + shift
+        fixes.append(position_fix(t, place, covariance))
+    return fixes
 
 
 def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix]) -> list[NavState]:
@@ -53,9 +52,8 @@ def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(backend):
         assert np.linalg.eigvalsh(track.covariance[:, 6:9, 6:9]).min() > 0.0
         found.append((track, states[-1], shift))
     (near, last, _), (far, far_last, _) = found
-    np.testing.assert_allclose(
-        far.trajectory.position_W - MAP, near.trajectory.position_W, atol=1e-4
-    )
+    shifted = far.trajectory.position_W - MAP
+    np.testing.assert_allclose(shifted, near.trajectory.position_W, atol=1e-4)
     np.testing.assert_allclose(far.covariance[-1], near.covariance[-1], rtol=1e-3, atol=1e-9)
     np.testing.assert_allclose(far_last.p_W - MAP, last.p_W, atol=1e-4)
     np.testing.assert_allclose(far_last.covariance, last.covariance, rtol=1e-3, atol=1e-9)
@@ -112,22 +110,15 @@ def test_a_heading_alone_does_not_make_the_position_uncertain(make_walk, make_or
     assert track.covariance[0, 6:9, 6:9].trace() < 0.01
 
 
-class Climbing:
-    """A network that adds 0.4 m of height to every displacement."""
-
-    def __init__(self, inner: Any) -> None:
-        self.inner = inner
-
-    def predict(self, windows: Any) -> Any:
-        mean, covariance = self.inner.predict(windows)
-        return mean + np.array([0.0, 0.0, 0.4]), covariance
-
-
 @pytest.mark.slow
 def test_fixes_that_agree_prevail_over_an_overconfident_track(make_walk, make_oracle):
     """Otherwise it ends twenty metres too high, as each fix alone looks like an outlier."""
     walk = make_walk(3, 60.0, 50.0)
-    climbing = Climbing(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02))
+
+    def climb(number, mean, covariance):
+        mean[:, 2] += 0.4
+
+    climbing = Altered(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02), climb)
     fixes = fixes_of(walk, np.arange(3.0, 59.0, 2.0), np.zeros(3))
     track = Navigator(climbing, CONFIG, backend="ekf").run(walk, fixes=fixes)
     truth = walk.truth.at(np.clip(track.time, walk.time[0], walk.time[-1]))
@@ -188,13 +179,9 @@ def test_positions_undo_a_yaw_that_pointed_backwards():
 
 
 def test_more_accurate_positions_move_a_stationary_track(still_model):
-    time = np.arange(0.0, 20.0, 0.01)
-    still = ImuSequence(
-        "still", time, np.zeros((len(time), 3)), np.tile([0.0, 0.0, 9.81], (len(time), 1))
-    )
     fixes = [position_fix(3.0, [40.0, -30.0, 8.0], 2500.0 * np.eye(3))]
     fixes += [position_fix(t, np.zeros(3), np.eye(3)) for t in (5.0, 8.0, 11.0)]
-    track = Navigator(still_model, backend="ekf").run(still, fixes=fixes)
+    track = Navigator(still_model, backend="ekf").run(lying(20.0), fixes=fixes)
     assert np.linalg.norm(track.trajectory.position_W[-1]) < 1.0
     sigma = np.sqrt(np.diag(track.covariance[-1])[6:9])
     assert ((sigma > 0.5) & (sigma < 1.5)).all()
@@ -225,10 +212,8 @@ def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(make_walk, wit
     broken = without(walk, (walk.time > 8.0) & (walk.time < 8.9))
     prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), np.zeros(3), walk.truth.position_W[0])
     useless = [position_fix(t, np.zeros(3), 1e6 * np.eye(3)) for t in np.arange(8.1, 8.9, 0.1)]
-    plain, cut = (
-        Navigator(still_model, prior=prior, backend="ekf").run(broken, fixes=f)
-        for f in ([], useless)
-    )
+    navigator = Navigator(still_model, prior=prior, backend="ekf")
+    plain, cut = (navigator.run(broken, fixes=fixes) for fixes in ([], useless))
     row = np.searchsorted(plain.time, 8.95)
     assert plain.covariance[row, 2, 2] > 0.2
     np.testing.assert_allclose(cut.covariance[row, 2, 2], plain.covariance[row, 2, 2], rtol=1e-3)
@@ -258,9 +243,6 @@ def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height():
     assert track.health.fixes == {"applied": 1, "yaw not known": 1}
 
 
-# --- the direction of a track from several positions together -------------------------------------
-
-
 def test_positions_too_close_to_give_a_direction_alone_give_it_together():
     walk, _, oracle = measured(13, 45.0, CONFIG, noise=0.02)
     farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
@@ -274,12 +256,7 @@ def test_positions_too_close_to_give_a_direction_alone_give_it_together():
     assert abs(yaw) < 3.0 * np.sqrt(track.covariance[-1, 2, 2])
 
 
-# --- the alignment -------------------------------------------------------------------------------
-
-
-def alignment_of(
-    rng: np.random.Generator, turn: float, count: int, sigma: float
-) -> PlanarAlignment:
+def alignment_of(rng: np.random.Generator, turn, count, sigma) -> PlanarAlignment:
     """Alignment of a walk in a room, with independent noise in every fix."""
     z = rng.uniform(-2.0, 2.0, count) + 1j * rng.uniform(-2.0, 2.0, count)
     noise = rng.normal(0.0, sigma, count) + 1j * rng.normal(0.0, sigma, count)

@@ -6,39 +6,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded import DATA
+from support import lying
 
-from stario.fusion import Navigator, PriorPose, Track
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, PriorPose, Track
 from stario.fusion.filter.zero_velocity import Stillness
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.network import load_model
-from stario.sequences import read_recording
+from stario.sequences import PHONE_IMU, ImuSequence, read_recording
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulation.imu import PHONE_IMU
 
 CONFIG = NavigatorConfig()
 NO_STILLNESS = replace(CONFIG, filter=replace(CONFIG.filter, stillness_noise=0.0))
 BIAS = np.array([2e-3, -1e-3, 1.5e-3])
-GRAVITY = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
-def lying(
-    seconds: float, rate: float = 100.0, turn: float = 0.0, bias: np.ndarray = BIAS
-) -> ImuSequence:
+def on_table(seconds: float, rate=100.0, turn=0.0, bias=BIAS) -> ImuSequence:
     """A phone that lies on a table, or turns about the vertical at the rate `turn` [rad/s]."""
-    rng = np.random.default_rng(0)
-    n = round(seconds * rate) + 1
-    white = np.sqrt(rate) * rng.standard_normal((2, n, 3))
-    gyro = bias + [0.0, 0.0, turn] + PHONE_IMU.noise.gyro_noise * white[0]
-    accel = GRAVITY + PHONE_IMU.noise.accel_noise * white[1]
-    return ImuSequence("lying", np.arange(n) / rate, gyro, accel)
-
-
-def fraction_at_rest(sequence: ImuSequence) -> float:
-    intervals, _ = cut_recording(sequence, CONFIG)
-    return float(np.mean(at_rest(intervals)))
+    noise, density = PHONE_IMU.noise, np.sqrt(rate)
+    gyro = np.add(bias, [0.0, 0.0, turn])
+    return lying(seconds, rate, gyro, density * noise.gyro_noise, density * noise.accel_noise)
 
 
 def at_rest(intervals: list[ImuInterval]) -> list[bool]:
@@ -51,7 +38,8 @@ def at_rest(intervals: list[ImuInterval]) -> list[bool]:
 
 @pytest.mark.parametrize("rate", [50.0, 1000.0])
 def test_a_device_on_a_table_is_at_rest_after_a_second(rate):
-    assert fraction_at_rest(lying(5.0, rate)) == pytest.approx(41 / 50, abs=0.05)
+    intervals, _ = cut_recording(on_table(5.0, rate), CONFIG)
+    assert np.mean(at_rest(intervals)) == pytest.approx(41 / 50, abs=0.05)
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket", "trolley"])
@@ -65,7 +53,7 @@ def test_a_moving_device_is_not_at_rest(make_walk, carry):
 
 
 def test_rest_needs_a_whole_second_and_a_gap_ends_it():
-    intervals, front_end = cut_recording(lying(6.0), CONFIG)
+    intervals, front_end = cut_recording(on_table(6.0), CONFIG)
     intervals[30] = replace(intervals[30], levelled=front_end.start)
     found = at_rest(intervals)
     assert not any(found[:9])
@@ -80,7 +68,7 @@ def yaw_drift(track: Track) -> float:
 
 
 def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model):
-    table = lying(30.0, 50.0)
+    table = on_table(30.0, 50.0)
     with_zero_velocity = Navigator(still_model, CONFIG, backend="ekf").run(table)
     without = Navigator(still_model, NO_STILLNESS, backend="ekf").run(table)
     assert with_zero_velocity.health.zero_velocity == {"applied": 291}
@@ -96,7 +84,7 @@ def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model):
 
 def test_a_device_at_rest_does_not_drift_with_the_predictions():
     """Trained on walks, the network predicts a centimetre per second on a table."""
-    graph = Navigator(load_model(), CONFIG).run(lying(30.0, 50.0))
+    graph = Navigator(load_model(), CONFIG).run(on_table(30.0, 50.0))
     for track in (graph, graph.filtered):
         assert np.linalg.norm(track.trajectory.position_W[-1]) < 0.05
         error, P = track.trajectory.position_W[-1], track.covariance[-1, 6:9, 6:9]
@@ -106,7 +94,7 @@ def test_a_device_at_rest_does_not_drift_with_the_predictions():
 @pytest.mark.parametrize("seconds", [5.0, 20.0])
 def test_a_standing_person_who_sways_teaches_no_bias(still_model, seconds):
     """On a table the gyroscope reads its bias; a person turns it to and fro by 1.5 deg/s."""
-    table = lying(40.0, 50.0, bias=np.zeros(3))
+    table = on_table(40.0, 50.0, bias=np.zeros(3))
     sway = np.radians(1.5) * np.sin(2.0 * np.pi / seconds * table.time)
     swaying = replace(table, gyro=table.gyro + np.outer(sway, [0.0, 0.0, 1.0]))
     track = Navigator(still_model, CONFIG, backend="ekf").run(swaying)
@@ -116,7 +104,7 @@ def test_a_standing_person_who_sways_teaches_no_bias(still_model, seconds):
 
 def test_rest_gives_no_information_about_yaw(still_model):
     prior = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3), yaw_sigma=0.3)
-    track = Navigator(still_model, CONFIG, prior, backend="ekf").run(lying(10.0))
+    track = Navigator(still_model, CONFIG, prior, backend="ekf").run(on_table(10.0))
     assert np.sqrt(track.covariance[-1, 2, 2]) > 0.3
 
 
@@ -125,16 +113,15 @@ def test_a_steady_glide_is_not_stopped(still_model):
     fast = PriorPose(np.eye(3), np.array([1.5, 0.0, 0.0]), np.zeros(3), 1e-3, 0.02, 0.05)
     quiet = replace(CONFIG.filter, accel_bias_sigma=0.02)
     config = replace(CONFIG, noise=PHONE_IMU.noise, filter=quiet)
-    track = Navigator(still_model, config, fast, backend="ekf").run(lying(3.0, bias=np.zeros(3)))
+    track = Navigator(still_model, config, fast, backend="ekf").run(on_table(3.0, bias=np.zeros(3)))
     assert track.health.zero_velocity == {"gated": 21}
     assert track.trajectory.velocity_W[-1, 0] > 1.2
 
 
 def test_a_slow_turn_is_not_mistaken_for_bias(still_model):
     """Unless it lasts for longer than anybody turns so evenly."""
-    track = Navigator(still_model, CONFIG, backend="ekf").run(
-        lying(3.0, turn=0.05, bias=np.zeros(3))
-    )
+    turning = on_table(3.0, turn=0.05, bias=np.zeros(3))
+    track = Navigator(still_model, CONFIG, backend="ekf").run(turning)
     assert np.abs(track.b_g[-1]).max() < 0.01
 
 

@@ -7,23 +7,18 @@ import numpy as np
 from initial_ekf import Driven
 from simulated import measured
 from support import GRAPH as CONFIG
-from support import stream, true_start
+from support import lying, nav_state, samples, stream, true_start
 
-from stario.fusion import Navigator, NavState
+from stario.fusion import Navigator, NavigatorConfig, NavState
 from stario.fusion.filter import estimator
 from stario.fusion.filter.gained import gained_information
 from stario.fusion.filter.magnetic import with_field
 from stario.fusion.graph.fixed_lag import FixedLag
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.term import IndeterminateError
-from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.lie import yaw_twist
-from stario.sequences.attitude.rotations import about_z
+from stario.sequences import ImuSequence, MagneticField, about_z, simulate_imu
 from stario.sequences.attitude.so3 import exp_so3, log_so3
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.magnetometer import MagneticField
 
 
 def lagged(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
@@ -46,10 +41,9 @@ def assert_valid(state: NavState) -> None:
 def test_a_stream_is_about_as_accurate_as_the_filter():
     """Same times, similar errors and sigmas; above all yaw's, which only fixes determine."""
     walk, _, oracle = measured(5, 16.0, CONFIG)
-    ours, theirs = (
-        stream(Navigator(oracle, CONFIG, true_start(walk), backend), walk)
-        for backend in ("graph", "ekf")
-    )
+    start = true_start(walk)
+    navigators = (Navigator(oracle, CONFIG, start, backend) for backend in ("graph", "ekf"))
+    ours, theirs = (stream(navigator, walk) for navigator in navigators)
     assert [s.time for s in ours] == [s.time for s in theirs]
     assert errors(ours, walk).mean() < 1.3 * errors(theirs, walk).mean() + 0.02
     sigma, expected = (np.sqrt(np.diag(states[-1].covariance)) for states in (ours, theirs))
@@ -64,15 +58,12 @@ def test_a_tilted_start_misleads_a_stream_no_more_than_the_filter(make_walk, mak
     oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.03)
     start = true_start(walk)
     tilted = replace(start, R_WB=exp_so3(np.array([0.3, 0.0, 0.0])) @ start.R_WB, tilt_sigma=0.05)
-    ours, theirs = (
-        stream(Navigator(oracle, config, tilted, backend), walk) for backend in ("graph", "ekf")
-    )
+    navigators = (Navigator(oracle, config, tilted, backend) for backend in ("graph", "ekf"))
+    ours, theirs = (stream(navigator, walk) for navigator in navigators)
     assert errors(ours, walk).max() < 1.1 * errors(theirs, walk).max() + 0.1
 
 
-def track_with_outliers(
-    preprocessed: PreprocessedRecording, config: NavigatorConfig, metres: float, intervals: range
-) -> tuple[np.ndarray, int]:
+def track_with_outliers(preprocessed, config, metres: float, intervals: range):
     """Positions until 3 s after intervals with false displacements, and the number gated."""
     filtered = estimator.begin(config, preprocessed.start, streaming=True)
     graph, positions = FixedLag(filtered, config), []
@@ -107,11 +98,8 @@ def test_a_stream_gates_displacements_itself_if_the_filter_uses_more_of_them(wal
     config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=20))
     oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
     preprocessed = Navigator(oracle, config).observe(walk)
-    at = next(
-        k
-        for k, interval in enumerate(preprocessed.intervals)
-        if interval.stop > walk.time[0] + 2.99
-    )
+    late = (k for k, each in enumerate(preprocessed.intervals) if each.stop > walk.time[0] + 2.99)
+    at = next(late)
     clean, _ = track_with_outliers(preprocessed, config, 0.0, range(at, at + 1))
     corrupted, _ = track_with_outliers(preprocessed, config, 1.2, range(at, at + 1))
     assert np.linalg.norm(corrupted - clean, axis=1).max() < 0.35
@@ -142,9 +130,9 @@ def test_a_late_fix_that_changes_the_gating_brings_a_stream_to_its_filter():
     for backend in ("graph", "ekf"):
         navigator = Navigator(oracle, CONFIG, fast, backend)
         states = []
-        for time, gyro, accel in zip(walk.time, walk.gyro, walk.accel, strict=True):
-            states.append(navigator.push(time, gyro, accel))
-            if abs(time - 1.15) < 1e-6:
+        for row in samples(walk):
+            states.append(navigator.push(*row))
+            if abs(row[0] - 1.15) < 1e-6:
                 navigator.update_velocity(0.3, v_W, 1e-4 * np.eye(3))
         late.append(errors([s for s in states if s is not None and s.time > 1.2], walk))
     assert late[1].max() < 0.5
@@ -169,10 +157,8 @@ def test_a_lag_longer_than_the_walk_changes_little(walk, make_oracle):
     """Marginalised information is kept."""
     walk = walk.slice(0.0, 8.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    ends = [
-        stream(lagged(oracle, replace(CONFIG, graph=replace(CONFIG.graph, lag=lag))), walk)[-1]
-        for lag in (3.0, 60.0)
-    ]
+    configs = (replace(CONFIG, graph=replace(CONFIG.graph, lag=lag)) for lag in (3.0, 60.0))
+    ends = [stream(lagged(oracle, config), walk)[-1] for config in configs]
     assert np.linalg.norm(ends[0].p_W - ends[1].p_W) < 0.15
     np.testing.assert_allclose(*(np.sqrt(np.diag(s.covariance)) for s in ends), rtol=0.05)
 
@@ -197,9 +183,8 @@ def test_late_fixes_correct_the_newest_state_too(walk, make_oracle):
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     navigator = lagged(oracle, prior=true_start(walk))
     measured = walk.truth.at(np.array([10.33, 14.0])).position_W
-    rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
     before = after = None
-    for row in rows:
+    for row in samples(walk):
         if navigator.push(*row) is None:
             continue
         if abs(row[0] - 10.9) < 0.01 and before is None:  # more than half a second late
@@ -217,14 +202,8 @@ def test_late_fixes_correct_the_newest_state_too(walk, make_oracle):
 
 def test_rest_stops_the_drift(still_model):
     """A device on a table with an uninformative network."""
-    rng = np.random.default_rng(0)
-    n = 1500
-    time = np.arange(n) / 100.0
-    gyro = 2e-3 + 2e-3 * rng.normal(size=(n, 3))
-    accel = np.array([0.0, 0.0, 9.80665]) + 0.02 * rng.normal(size=(n, 3))
     navigator = lagged(still_model)
-    for row in zip(time, gyro, accel, strict=True):
-        navigator.push(*row)
+    stream(navigator, lying(15.0, 100.0, 3 * [2e-3], 2e-3, 0.02))
     assert navigator.health.zero_velocity["applied"] > 100
     assert np.linalg.norm(navigator.state.p_W) < 0.1
     np.testing.assert_allclose(navigator.state.b_g, 2e-3, atol=2e-4)
@@ -249,10 +228,7 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(walk, make_orac
     np.testing.assert_allclose(states[at].p_W, filtered[at].p_W, atol=1e-9)
     assert len(calls) > 20
     assert errors(states[-1:], walk)[0] < errors(filtered[-1:], walk)[0] + 0.3
-    assert (
-        "fell back to the filter 1 times, last because velocity at 8.0 s is undetermined"
-        in navigator.health.notes[0]
-    )
+    assert "velocity at 8.0 s is undetermined" in navigator.health.notes[0]
 
 
 def test_after_a_long_gap_the_graph_restarts(make_walk, make_oracle, without):
@@ -267,9 +243,6 @@ def test_after_a_long_gap_the_graph_restarts(make_walk, make_oracle, without):
     assert not any("fell back" in note for note in track.health.notes)
 
 
-# --- magnetic bearings ----------------------------------------------------------------------------
-
-
 Z = [0, 1, 2, 9, 10, 11]
 FIELD_B = np.array([15.0, -8.0, -40.0])
 
@@ -280,8 +253,7 @@ def ekf_with_field() -> Driven:
     P = 0.01 * np.eye(15)
     P[2, 11] = P[11, 2] = 2e-4
     P[9:12, 9:12] = 1e-5 * np.eye(3)
-    zero = np.zeros(3)
-    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, P))
+    ekf.initialise(nav_state(P))
     ekf.state = with_field(ekf.state, FIELD_B)
     P = ekf.P.copy()
     P[-5:, -5:] = np.diag([0.04**2, 0.05**2, 1.0, 1.0, 1.0])  # a field known from before
@@ -305,15 +277,9 @@ def test_the_information_gained_gives_the_filters_covariance_and_mean():
     change = np.concatenate([turned, after.b_g - before.b_g])
     assert abs(turned[2]) > 0.01
     np.testing.assert_allclose(gain * (value + u @ change), change, rtol=0.02, atol=1e-6)
-
-
-def test_an_update_without_yaw_and_bias_gains_nothing():
-    ekf = Driven(slots=0)
-    zero = np.zeros(3)
-    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 0.01 * np.eye(15)))
-    before = ekf.state
+    # An update of neither yaw nor bias gains nothing.
     ekf.update_position_W(np.ones(3), 0.01 * np.eye(3))
-    assert gained_information(before, ekf.state) is None
+    assert gained_information(after, ekf.state) is None
 
 
 def test_the_field_bounds_the_yaw_of_a_stream(make_walk, make_oracle):
@@ -322,9 +288,7 @@ def test_the_field_bounds_the_yaw_of_a_stream(make_walk, make_oracle):
     walk = simulate_imu(truth, 50.0, magnetic_field=MagneticField(), seed=3)
     noisy = replace(CONFIG, noise=replace(CONFIG.noise, gyro_noise=0.144))
     oracle = make_oracle(walk, truth, noisy, noise=0.03, sigma=0.03)
-    graph, ekf = (
-        np.sqrt(stream(Navigator(oracle, noisy, backend=backend), walk)[-1].covariance[2, 2])
-        for backend in ("graph", "ekf")
-    )
+    navigators = (Navigator(oracle, noisy, backend=backend) for backend in ("graph", "ekf"))
+    graph, ekf = (np.sqrt(stream(each, walk)[-1].covariance[2, 2]) for each in navigators)
     assert ekf < 0.48
     assert 0.9 * ekf < graph < 1.1 * ekf

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measured
 from support import GRAPH as CONFIG
-from support import stream, true_start
+from support import nav_state, stream, true_start
 from told import health_lines
 
 from stario.fusion import Navigator, backends
@@ -23,11 +23,7 @@ from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.values.lie import yaw_twist
 from stario.fusion.values.state import NavState
-from stario.sequences.accuracy.nees import position_nees
-from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.noise import ImuNoise
-from stario.sequences.settings import with_settings
+from stario.sequences import ImuNoise, about_z, position_nees, yaw_of
 
 
 def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
@@ -42,9 +38,6 @@ def oracle(walk, make_oracle):
 @pytest.fixture(scope="module")
 def filtered(walk, oracle):
     return Navigator(oracle, CONFIG, backend="ekf").run(walk)
-
-
-# --- accuracy --------------------------------------------------------------------------------
 
 
 def test_states_are_at_the_filters_times_with_a_smaller_covariance(walk, oracle, filtered):
@@ -79,8 +72,8 @@ def smooth_turned(filtered, *others):
     """Smooth from headings that are off by 6 rad in the end."""
     turns = about_z([0.3 * (state.time - filtered[0].time) for state in filtered]).as_matrix()
     lost = [
-        replace(state, R_WB=turn @ state.R_WB, v_W=turn @ state.v_W, p_W=turn @ state.p_W)
-        for state, turn in zip(filtered, turns, strict=True)
+        replace(s, **{name: turn @ getattr(s, name) for name in ("R_WB", "v_W", "p_W")})
+        for s, turn in zip(filtered, turns, strict=True)
     ]
     return smooth(lost, *others)
 
@@ -104,10 +97,10 @@ def test_a_track_that_does_not_converge_is_not_given_out(walk, oracle, filtered,
     monkeypatch.setattr(keyframes, "_SMALL_TURNS", 1)
     found = graph(oracle).run(walk)
     np.testing.assert_array_equal(found.trajectory.position_W, filtered.trajectory.position_W)
-    assert "converge" in " ".join(found.health.notes)
-
-
-# --- symmetries ------------------------------------------------------------------------------
+    np.testing.assert_array_equal(found.covariance, filtered.covariance)
+    [note] = found.health.notes
+    assert "converge" in note
+    assert any("filter's track" in line for line in health_lines(found.health))
 
 
 def test_a_turned_and_shifted_world_turns_and_shifts_the_track(walk, make_oracle):
@@ -123,12 +116,8 @@ def test_a_turned_and_shifted_world_turns_and_shifts_the_track(walk, make_oracle
     np.testing.assert_allclose(there.velocity_W, turn.apply(here.velocity_W), atol=1e-4)
 
 
-# --- an indeterminate system -----------------------------------------------------------------
-
-
 def first_state(covariance: np.ndarray) -> NavState:
-    zero = np.zeros(3)
-    return NavState(12.3, np.eye(3), zero, zero, zero, zero, covariance)
+    return nav_state(covariance, 12.3)
 
 
 @pytest.mark.parametrize(("first", "name"), [(3, "velocity"), (6, "position"), (9, "bias")])
@@ -139,28 +128,9 @@ def test_an_undetermined_state_is_named(first, name):
     samples = np.linspace(12.3, 13.3, 11), np.zeros((11, 3)), np.tile([0.0, 0.0, 9.80665], (11, 1))
     segment = preintegrate(*samples, np.zeros(3), np.zeros(3), ImuNoise(), 9.80665)
     graph.add_keyframe(13.3, KeyframeState.from_nav(first_state(np.eye(15))), segment)
-    with pytest.raises(IndeterminateError, match=rf"{name} at 1[23]\.3 s"):
+    with pytest.raises(IndeterminateError, match=f"{name} at"):
         graph.solve()
     np.testing.assert_array_equal(graph.states[1].p_W, np.zeros(3))
-
-
-def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(
-    walk, make_oracle, monkeypatch
-):
-    def fails(self, **options):
-        raise IndeterminateError("velocity at 12.3 s is undetermined")
-
-    walk = walk.slice(0.0, 13.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG)
-    filtered = Navigator(oracle, CONFIG, backend="ekf").run(walk)
-    monkeypatch.setattr(KeyframeGraph, "solve", fails)
-    track = graph(oracle).run(walk)
-    np.testing.assert_array_equal(track.trajectory.position_W, filtered.trajectory.position_W)
-    np.testing.assert_array_equal(track.covariance, filtered.covariance)
-    assert track.health.notes == [
-        "graph fell back to the filter's track: velocity at 12.3 s is undetermined"
-    ]
-    assert any("filter's track" in line for line in health_lines(track.health))
 
 
 def test_the_graph_accepts_a_perfect_sensor(walk, make_oracle):
@@ -169,9 +139,6 @@ def test_the_graph_accepts_a_perfect_sensor(walk, make_oracle):
     track = graph(make_oracle(walk, walk.truth, exact), exact).run(walk)
     assert np.isfinite(track.trajectory.position_W).all()
     assert track.health.notes == []  # it did not fall back
-
-
-# --- bad input -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length", [0.3, 3.0])
@@ -187,9 +154,6 @@ def test_a_gap_is_crossed_and_its_sigma_covers_the_error(walk, make_oracle, with
     start = walk.truth.position_W[0]
     error = np.linalg.norm(turn.apply(track.trajectory.position_W[-1]) + start - at_end.position_W)
     assert error < 4.0 * np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9])) + 0.5
-
-
-# --- fixes -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("time", [10.0, 10.37, 10.4])
@@ -211,14 +175,11 @@ def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(walk, make_oracle,
 def test_the_track_meets_heading_and_velocity_fixes(walk, make_oracle):
     walk = walk.slice(0.0, 16.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
-    prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), walk.truth.velocity_W[0], np.zeros(3))
     truth = walk.truth.at(np.array([9.25, 14.0]))
     yaw = float(yaw_of(truth.attitude_WB)[0])
-    fixes = [
-        yaw_fix(9.25, yaw, 1e-3),
-        velocity_fix(14.0, truth.velocity_W[1], 1e-4 * np.eye(3)),
-    ]
-    track = graph(oracle, prior=prior).run(walk, fixes=fixes)
+    fixes = [yaw_fix(9.25, yaw, 1e-3)]
+    fixes += [velocity_fix(14.0, truth.velocity_W[1], 1e-4 * np.eye(3))]
+    track = graph(oracle, prior=true_start(walk)).run(walk, fixes=fixes)
     near = int(np.argmin(np.abs(track.time - 9.25)))
     at = walk.truth.at(track.time[[near]])
     off = yaw_of(track.trajectory.attitude_WB[[near]] * at.attitude_WB.inv())
@@ -291,14 +252,3 @@ def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(make_w
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
     assert 0.05 < np.median(nees) < 2.4  # median of chi-square with 3 DoF: 2.4
     assert track.health.fixes["applied"] == 2
-
-
-@pytest.mark.parametrize("lag", [0.5, 100.0, float("nan")])
-def test_a_lag_out_of_bounds_is_refused(lag):
-    with pytest.raises(ConfigError, match=r"graph\.lag"):
-        with_settings(NavigatorConfig(), {"graph": {"lag": lag}})
-
-
-def test_an_unknown_back_end_is_refused_by_name(still_model):
-    with pytest.raises(InputError, match="backend: found 'ukf', expected one of ekf, graph"):
-        Navigator(still_model, backend="ukf")

@@ -4,26 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import samples, stream
 from told import health_lines, told
 
 from stario.fusion import Navigator, NavigatorConfig, PriorPose
 from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError, OutlierDetector
 from stario.fusion.recording import cut_recording
 from stario.network import load_model
-from stario.sequences.inspection.report import inspect_recording
-from stario.sequences.sequence import ImuSequence
-
-# --- saturation ------------------------------------------------------------------------------
+from stario.sequences import ImuSequence, inspect_recording
 
 
 def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
     """Number of samples flagged in a stream that is checked interval by interval."""
     detector, rows = OutlierDetector(), np.zeros((len(gyro_x), 7))
     rows[:, 0], rows[:, 1] = 0.01 * np.arange(len(gyro_x)), gyro_x
-    found = [
-        detector.detect(rows[k : k + size].copy()).saturated
-        for k in range(0, len(rows) - 1, size - 1)
-    ]
+    pieces = (rows[k : k + size].copy() for k in range(0, len(rows) - 1, size - 1))
+    found = [detector.detect(piece).saturated for piece in pieces]
     return sum(found)
 
 
@@ -47,9 +43,6 @@ def test_a_clipped_sine_is_saturated_at_its_limit():
     clipped = np.clip(8.0 * np.sin(np.arange(0.0, 40.0, 0.05)), -5.0, 5.0)
     stuck = int(((clipped[1:] == clipped[:-1]) & (np.abs(clipped[1:]) == 5.0)).sum())
     assert stuck - 2 <= count_saturated(clipped) <= stuck
-
-
-# --- spikes ----------------------------------------------------------------------------------
 
 
 def test_a_spike_is_replaced_by_its_neighbours_mean_and_the_last_sample_by_the_one_before():
@@ -79,11 +72,7 @@ def test_zeros_of_an_accelerometer_are_no_free_fall(make_walk, still_model):
     walk = make_walk(3, 4.0).without_truth()
     accel = walk.accel.copy()
     accel[250:260] = 0.0
-    health = Navigator(still_model).run(replace(walk, accel=accel)).health
-    assert health.samples["frozen"] == 10
-
-
-# --- a clock that is set back ----------------------------------------------------------------
+    assert Navigator(still_model).run(replace(walk, accel=accel)).health.samples["frozen"] == 10
 
 
 def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
@@ -91,12 +80,16 @@ def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
     return replace(walk.without_truth(), time=np.where(late, walk.time - by, walk.time))
 
 
+def in_order(walk: ImuSequence, rows: np.ndarray) -> ImuSequence:
+    return replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
+
+
 def test_a_stream_raises_an_error_and_restarts(make_walk, still_model):
     walk = set_back(make_walk(3, 16.0), 100.0)
     first = PriorPose(np.eye(3), np.zeros(3), np.array([50.0, 0.0, 0.0]))
     navigator, states, errors = Navigator(still_model, prior=first), [], []
     navigator.update_position(500.0, np.zeros(3), np.eye(3))
-    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+    for row in samples(walk):
         try:
             states.append(navigator.push(*row))
         except ClockSetBackError as error:
@@ -136,22 +129,15 @@ def test_late_samples_and_bursts_are_not_another_clock():
 
 def test_a_block_that_is_logged_twice_does_not_change_the_track(make_walk, still_model):
     walk = make_walk(3, 16.0).without_truth()
-    rows = np.r_[0:800, 600 : len(walk)]
-    twice = replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
-    track, plain = (
-        Navigator(still_model, backend="ekf").run(twice),
-        Navigator(still_model, backend="ekf").run(walk),
-    )
+    twice = in_order(walk, np.r_[0:800, 600 : len(walk)])
+    track, plain = (Navigator(still_model, backend="ekf").run(each) for each in (twice, walk))
     np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
 
 
 def test_shuffled_rows_are_reported_with_the_advice_to_sort_them(make_walk):
     walk = make_walk(3, 16.0)
     order = np.random.default_rng(0).permutation(len(walk))
-    shuffled = replace(
-        walk.without_truth(), time=walk.time[order], gyro=walk.gyro[order], accel=walk.accel[order]
-    )
-    problems = " ".join(told(shuffled))
+    problems = " ".join(told(in_order(walk.without_truth(), order)))
     assert "sort the rows" in problems
     assert "ms" not in problems
 
@@ -171,8 +157,7 @@ def test_a_clock_set_back_by_a_few_seconds_is_a_gap(make_walk, backend):
     walk = make_walk(3, 16.0)
     back = set_back(walk, 3.0)
     navigator = Navigator(load_model(), backend=backend)
-    states = [navigator.push(*row) for row in zip(back.time, back.gyro, back.accel, strict=True)]
-    after = [state for state in states if state is not None and state.time > 8.0][:30]
+    after = [state for state in stream(navigator, back) if state.time > 8.0][:30]
     true = walk.truth.at(np.array([state.time + 3.0 for state in after]))
     for state, up_B in zip(after, true.attitude_WB.inv().apply([0.0, 0.0, 1.0]), strict=True):
         tilt = np.linalg.norm(np.cross(state.R_WB.T[:, 2], up_B))

@@ -4,32 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import Altered, Counting, stream
 
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig
 from stario.fusion.imu.direction import Direction, direction, weighted_force
 from stario.fusion.imu.inference import StatefulInference
-from stario.fusion.navigator import Navigator
 from stario.fusion.recording import cut_recording
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
-from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
-from stario.sequences.errors import InputError
+from stario.sequences import PERFECT_IMU, PHONE_IMU, InputError, generate_walk, simulate_imu
 from stario.sequences.levelled_stream import TICK_SAMPLES, TICKS_PER_SECOND, levelled_streams
-from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.windows import WINDOW_SAMPLES
-
-
-class Counting:
-    """Predicts one metre upwards per window in its memory, separately for each series."""
-
-    is_recurrent = True
-
-    def predict(self, windows):
-        raise AssertionError("a network with memory must be called through `predict_next`")
-
-    def predict_next(self, windows, updates, memory):
-        first, n = memory or 0, len(windows)
-        mean = np.zeros((n, 3))
-        mean[:, 2] = (first + np.arange(n)) // updates
-        return mean, np.tile(np.eye(3), (n, 1, 1)), first + n
 
 
 def with_gap(walk, without):
@@ -41,9 +24,8 @@ def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, r
     config = NavigatorConfig(filter=FilterConfig(update_rate=rate))
     preprocessed = Navigator(Counting(), config).observe(with_gap(walk, without))
     stretches, all_counts = [[]], []
-    for interval, measurement in zip(
-        preprocessed.intervals, preprocessed.measurements, strict=True
-    ):
+    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    for interval, measurement in pairs:
         if interval.gap:
             stretches.append([])
         if measurement is not None:
@@ -59,14 +41,10 @@ def test_a_stream_equals_the_batch_also_after_a_restore(walk, without):
     sequence = with_gap(walk, without)
     track = Navigator(Counting(), backend="ekf").run(sequence).trajectory
     navigator = Navigator(Counting())
-    states = []
-    for k, sample in enumerate(zip(sequence.time, sequence.gyro, sequence.accel, strict=True)):
-        if k == 700:
-            navigator, data = Navigator(Counting()), navigator.snapshot()
-            navigator.restore(data)
-        state = navigator.push(*sample)
-        if state is not None:
-            states.append(state)
+    states = stream(navigator, sequence.select(slice(700)))
+    navigator, data = Navigator(Counting()), navigator.snapshot()
+    navigator.restore(data)
+    states += stream(navigator, sequence.select(slice(700, None)))
     at = np.searchsorted(track.time, [s.time for s in states])
     np.testing.assert_allclose([s.p_W for s in states], track.position_W[at], atol=1e-6)
 
@@ -74,8 +52,7 @@ def test_a_stream_equals_the_batch_also_after_a_restore(walk, without):
 def test_a_model_without_memory_refuses_that_of_another(walk, still_model):
     assert not StatefulInference(still_model, 10).is_recurrent
     navigator = Navigator(Counting())
-    for sample in zip(walk.time[:300], walk.gyro, walk.accel, strict=False):
-        navigator.push(*sample)
+    stream(navigator, walk.select(slice(300)))
     with pytest.raises(InputError, match="memory"):
         Navigator(still_model).restore(navigator.snapshot())
 
@@ -109,12 +86,10 @@ def test_a_recording_tells_a_network_that_walks_backwards(make_walk, make_oracle
     sequence, config = make_walk(seconds=60.0), NavigatorConfig()
     oracle = make_oracle(sequence, sequence.truth, config)
 
-    class Backwards:
-        def predict(self, windows):
-            displacement, covariance = oracle.predict(windows)
-            return -displacement, covariance
+    def turn_back(number, mean, covariance):
+        mean *= -1.0
 
-    counts = Navigator(Backwards(), config).observe(sequence).counts
+    counts = Navigator(Altered(oracle, turn_back), config).observe(sequence).counts
     assert abs(counts.network_turn) > np.radians(135.0)
     assert counts.network_turn_sigma < np.radians(20.0)
 

@@ -5,16 +5,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from se23 import exp_se23
 
-from stario.fusion import NavigatorConfig
+from stario.fusion import NavigatorConfig, Segment, preintegrate
 from stario.fusion.filter.jacobians import propagated
 from stario.fusion.imu.faults import OutlierDetector
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, ImuInterval
-from stario.fusion.imu.preintegration import (
-    Segment,
-    corrected_increments,
-    preintegrate,
-    segment_of,
-)
+from stario.fusion.imu.preintegration import corrected_increments, segment_of
 from stario.fusion.values.lie import log_se23
 from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
 from stario.sequences.noise import ImuNoise
@@ -32,13 +27,9 @@ def samples(rate: float, duration: float = 0.5) -> tuple[np.ndarray, np.ndarray,
 
 
 def state() -> tuple[np.ndarray, ...]:
-    return (
-        exp_so3(np.array([0.4, -1.2, 2.0])),
-        np.array([1.0, -0.6, 0.2]),
-        np.array([12.0, -7.0, 1.5]),
-        np.array([0.01, -0.02, 0.03]),
-        np.array([0.1, 0.2, -0.15]),
-    )
+    v_W, p_W = np.array([[1.0, -0.6, 0.2], [12.0, -7.0, 1.5]])
+    b_g, b_a = np.array([[0.01, -0.02, 0.03], [0.1, 0.2, -0.15]])
+    return exp_so3(np.array([0.4, -1.2, 2.0])), v_W, p_W, b_g, b_a
 
 
 def moved(x: tuple[np.ndarray, ...], error: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -68,16 +59,13 @@ def coning(rate: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray,
         R = y[:9].reshape(3, 3)
         return np.concatenate([(R @ skew(gyro)).ravel(), R @ accel])
 
-    end = solve_ivp(
-        rates, (0, 1), np.r_[np.eye(3).ravel(), 0, 0, 0], rtol=1e-12, atol=1e-12, method="DOP853"
-    ).y[:, -1]
+    y = np.r_[np.eye(3).ravel(), 0, 0, 0]
+    end = solve_ivp(rates, (0, 1), y, rtol=1e-12, atol=1e-12, method="DOP853").y[:, -1]
     gyro, accel = signals(t)
     return t, gyro, accel, end[:9].reshape(3, 3), end[9:]
 
 
-def integrated(
-    dt: np.ndarray, rate: np.ndarray, force: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def integrated(dt, rate, force) -> tuple[np.ndarray, np.ndarray]:
     R, v = np.eye(3), np.zeros(3)
     for step, w, a in zip(dt, rate, force, strict=True):
         v = v + R @ a * step
@@ -89,6 +77,12 @@ def interpolated(t: np.ndarray, values: np.ndarray, finer: int) -> np.ndarray:
     """Linear interpolation between samples, at `finer` times their rate."""
     fine = np.linspace(t[0], t[-1], finer * (len(t) - 1) + 1)
     return np.stack([np.interp(fine, t, column) for column in values.T], axis=1)
+
+
+def blow(t: np.ndarray, centre: float, seconds: float, speed: float) -> np.ndarray:
+    """Force upwards (N,) of a device that stands, and is struck to a speed [m/s]."""
+    phase = np.clip((t - centre) / seconds + 0.5, 0.0, 1.0)
+    return GRAVITY + speed * np.pi / 2.0 / seconds * np.sin(np.pi * phase)
 
 
 def test_a_segment_equals_dead_reckoning_on_fine_samples():
@@ -177,13 +171,11 @@ def test_noise_agrees_with_that_of_perturbed_samples():
                 if which >= 2:
                     column[(9 if which == 2 else 12) + axis] = 1.0
                 expected += np.outer(column, column) * sigma**2
-    noise = propagated(
-        preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY), R, v, p, b_g, b_a
-    ).noise[0]
+    segment = preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY)
+    noise = propagated(segment, R, v, p, b_g, b_a).noise[0]
     sigma = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        noise / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-3
-    )
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(noise / scale, expected / scale, atol=1e-3)
 
 
 def test_an_impact_between_samples_is_as_uncertain_as_the_force_changes():
@@ -191,10 +183,7 @@ def test_an_impact_between_samples_is_as_uncertain_as_the_force_changes():
     t = np.linspace(0.0, 0.1, 11)
     errors, sigmas = [], []
     for centre in np.linspace(0.045, 0.055, 21):
-        phase = np.clip((t - centre) / 0.012 + 0.5, 0.0, 1.0)
-        pulse = 3.0 * np.pi / 2.0 / 0.012 * np.sin(np.pi * phase)
-        accel = np.outer(GRAVITY + pulse, [0.0, 0.0, 1.0])
-        segment = _standing(t, accel)
+        segment = standing(t, blow(t, centre, 0.012, 3.0))
         velocity = segment.predict(np.eye(3), *np.zeros((4, 3)))[1][2]
         errors.append(velocity - 3.0)
         sigmas.append(np.sqrt(segment.pim.preintMeasCov()[8, 8]))
@@ -207,11 +196,9 @@ def test_what_a_sensor_missed_at_its_limit_is_within_its_sigma(rate):
     """A phone on a floor: 6 m/s within 20 ms, of which an accelerometer of 8 g measures a fifth."""
     t, limit = np.arange(0.0, 0.1 + 0.5 / rate, 1.0 / rate), 8.0 * GRAVITY
     for centre in np.linspace(0.045, 0.055, 11):
-        phase = np.clip((t - centre) / 0.02 + 0.5, 0.0, 1.0)
-        pulse = 6.0 * np.pi / 2.0 / 0.02 * np.sin(np.pi * phase)
-        accel = np.outer(np.minimum(GRAVITY + pulse, limit), [0.0, 0.0, 1.0])
-        flags = OutlierDetector().detect(np.column_stack([t, 0.0 * accel, accel]))
-        segment = _standing(t, accel, flags)
+        force = np.minimum(blow(t, centre, 0.02, 6.0), limit)
+        flags = OutlierDetector().detect(table_of(t, force))
+        segment = standing(t, force, flags)
         velocity = segment.predict(np.eye(3), *np.zeros((4, 3)))[1][2]
         assert abs(velocity - 6.0) > 4.0
         sigma = np.sqrt(segment.pim.preintMeasCov()[8, 8])
@@ -220,14 +207,17 @@ def test_what_a_sensor_missed_at_its_limit_is_within_its_sigma(rate):
 
 def test_a_walking_force_is_as_certain_as_its_density():
     t = np.linspace(0.0, 0.1, 11)
-    accel = np.outer(GRAVITY + 4.0 * np.sin(2.0 * np.pi * 2.0 * t), [0.0, 0.0, 1.0])
-    variance = _standing(t, accel).pim.preintMeasCov()[8, 8]
+    force = GRAVITY + 4.0 * np.sin(2.0 * np.pi * 2.0 * t)
+    variance = standing(t, force).pim.preintMeasCov()[8, 8]
     assert variance == pytest.approx(0.1 * NavigatorConfig().noise.accel_noise ** 2, rel=0.05)
 
 
-def _standing(time: np.ndarray, accel: np.ndarray, flags: Flags = NO_FLAGS) -> Segment:
-    table = np.column_stack([time, 0.0 * accel, accel])
-    interval = ImuInterval(table, np.eye(3), flags=flags)
+def table_of(time: np.ndarray, force: np.ndarray) -> np.ndarray:
+    return np.column_stack([time, np.zeros((len(time), 5)), force])
+
+
+def standing(time: np.ndarray, force: np.ndarray, flags: Flags = NO_FLAGS) -> Segment:
+    interval = ImuInterval(table_of(time, force), np.eye(3), flags=flags)
     return segment_of([interval], [1.0], np.zeros(3), np.zeros(3), NavigatorConfig())
 
 
@@ -249,9 +239,8 @@ def test_a_segment_with_noise_per_sample_equals_its_parts_in_sequence():
     whole = propagated(preintegrate(t, gyro, accel, *x[3:], parts, GRAVITY), *x)
     np.testing.assert_allclose(whole.transition, transition, atol=1e-2)
     sigma = np.sqrt(noise.diagonal())
-    np.testing.assert_allclose(
-        whole.noise[0] / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=2e-3
-    )
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(whole.noise[0] / scale, noise / scale, atol=2e-3)
     mean = replace(NOISE, accel_noise=NOISE.accel_noise * np.sqrt(np.mean([64, 1, 1, 16])))
     other = propagated(preintegrate(t, gyro, accel, *x[3:], mean, GRAVITY), *x).noise[0]
     assert other[6, 6] < 0.8 * noise[6, 6]

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from stario.fusion import Navigator, read_fixes
+from stario.fusion import LiveServer, Navigator, read_fixes
 from stario.fusion.live.hub import Hub
-from stario.fusion.live.run import LiveServer
 from stario.fusion.live.server import live_app
 from stario.fusion.live.session import Session
 from stario.sequences import read_recording
@@ -29,6 +28,18 @@ class SteadyWalk:
 def send(client, bodies, query=""):
     """Post pushes; return the answers."""
     return [client.post(f"/data{query}", content=body) for body in bodies]
+
+
+def lines(walk, count=None):
+    """JSON lines of a walk's samples."""
+    rows = zip(walk.time[:count].tolist(), walk.gyro.tolist(), walk.accel.tolist(), strict=False)
+    return [json.dumps({"device": "rig", "t": t, "gyro": g, "accel": a}) for t, g, a in rows]
+
+
+def send_lines(client, posted):
+    """Post JSON lines; return the answer."""
+    headers = {"content-type": "Application/X-NDJSON; charset=utf-8"}
+    return client.post("/data", content="\n".join(posted), headers=headers)
 
 
 def command(client, name, device="phone", **content):
@@ -91,13 +102,11 @@ def pushes(walk):
         count = len(walk) if seconds is None else round(100 * seconds)
         for begin in range(0, count, 20):
             rows = slice(begin, min(count, begin + 20))
+            times = [offset_ns + round(t * 1e9) for t in walk.time[rows].tolist()]
             payload = [
-                {"name": name, "time": offset_ns + round(t * 1e9)}
-                | {"values": {"x": x, "y": y, "z": z}}
+                {"name": name, "time": t, "values": dict(zip("xyz", value, strict=True))}
                 for name, values in (("gyroscope", walk.gyro), ("totalacceleration", walk.accel))
-                for t, (x, y, z) in zip(
-                    walk.time[rows].tolist(), values[rows].tolist(), strict=True
-                )
+                for t, value in zip(times, values[rows].tolist(), strict=True)
             ]
             message = {"messageId": len(encoded), "sessionId": session, "deviceId": device}
             encoded.append(json.dumps(message | {"payload": payload}).encode())

@@ -81,9 +81,8 @@ def test_an_old_or_repeated_place_neither_refuses_nor_divides_a_recording(client
 
 
 def test_pressure_in_another_unit_is_told_and_the_track_goes_on(client, hub, pushes):
-    bodies = added(
-        pushes(seconds=4.0), "barometer", lambda t: {"pressure": 100 * pressure(t)["pressure"]}
-    )
+    bodies = pushes(seconds=4.0)
+    bodies = added(bodies, "barometer", lambda t: {"pressure": 100 * pressure(t)["pressure"]})
     send(client, bodies)
     session = hub.sessions["phone"]
     assert "convert from Pa to hPa" in session.status()["problem"]

@@ -11,8 +11,7 @@ from stario.fusion.live import hub as hub_module
 from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.hub import MAX_DEVICES, SILENT_SECONDS, Viewer
 from stario.fusion.values.state import NavState
-from stario.sequences import read_recording
-from stario.sequences.attitude.rotations import about_z
+from stario.sequences import about_z, read_recording
 
 from .conftest import command, full_disk, send
 
@@ -48,9 +47,7 @@ def test_no_device_that_sends_makes_room_even_if_stopped(full, client, pushes):
     assert len(full.sessions) == MAX_DEVICES
 
 
-def test_a_recording_whose_end_cannot_be_written_makes_room_too(
-    full, client, pushes, monkeypatch, caplog
-):
+def test_a_recording_whose_end_is_lost_makes_room(full, client, pushes, monkeypatch, caplog):
     silent = full.sessions["phone5"]
     silent.received = 0.0
     silent.close()
@@ -84,9 +81,7 @@ def test_a_new_map_frame_rotates_position_yaw_and_covariance_together():
 
 
 @pytest.mark.parametrize("most", [7, 1000])
-def test_a_new_viewer_gets_no_more_points_than_a_message_may_hold(
-    client, hub, pushes, monkeypatch, most
-):
+def test_a_new_viewer_gets_no_more_points_than_allowed(client, hub, pushes, monkeypatch, most):
     send(client, pushes(seconds=4.0))
     monkeypatch.setattr(hub_module, "MAX_SENT", most)
     [device] = Viewer(hub).message()["devices"]

@@ -23,9 +23,8 @@ SECOND = 10**9
 def linear(sensor: str, rate: float, offset_ns: int, seconds: float = 2.0, slope: float = 1.0):
     """Readings whose axes are linear in time."""
     times = [offset_ns + round(k * SECOND / rate) for k in range(int(seconds * rate))]
-    return [
-        Reading(sensor, t, (slope * t / SECOND, 2.0 * t / SECOND, 3.0 - t / SECOND)) for t in times
-    ]
+    values = ((slope * t / SECOND, 2.0 * t / SECOND, 3.0 - t / SECOND) for t in times)
+    return [Reading(sensor, *pair) for pair in zip(times, values, strict=True)]
 
 
 def phone(*groups):
@@ -122,9 +121,10 @@ def test_a_missing_sensor_is_named():
 SENSOR_LOGGER = DATA / "raw/sensor_logger/university_loop"
 
 
-@pytest.mark.skipif(
-    not SENSOR_LOGGER.exists(), reason="the data folder holds no Sensor Logger walk"
-)
+needs_walk = pytest.mark.skipif(not SENSOR_LOGGER.exists(), reason="no Sensor Logger walk")
+
+
+@needs_walk
 def test_a_pushed_real_walk_equals_the_one_read_from_its_files():
     rows = []
     for file, name in (("Gyroscope", GYRO), ("TotalAcceleration", TOTAL)):
@@ -142,18 +142,15 @@ def test_a_pushed_real_walk_equals_the_one_read_from_its_files():
     np.testing.assert_allclose(time, recording.time - recording.time[0], atol=1e-6)
 
 
-@pytest.mark.skipif(
-    not SENSOR_LOGGER.exists(), reason="the data folder holds no Sensor Logger walk"
-)
+@needs_walk
 def test_specific_force_points_up_in_the_reported_attitude_of_a_real_phone():
     folder = SENSOR_LOGGER.parent / "shopping_mall_eight"
     payload = []
     for file in ("Gyroscope", "TotalAcceleration", "Orientation"):
         with (folder / f"{file}.csv").open() as table:
             for _, row in zip(range(120), csv.DictReader(table), strict=False):
-                values = {
-                    key: float(row[key]) for key in row if key in {*"xyz", "qx", "qy", "qz", "qw"}
-                }
+                known = {*"xyz", "qx", "qy", "qz", "qw"} & {*row}
+                values = {key: float(row[key]) for key in known}
                 payload.append({"name": file, "time": row["time"], "values": values})
     merger = Merger()
     merger.add(parse_push(json.dumps({"deviceId": "d", "payload": payload}).encode()).readings)
@@ -182,32 +179,6 @@ def test_nothing_waits_for_a_push_that_is_missing_in_the_recording_before(sessio
     assert session.track.samples == 80
 
 
-def test_a_push_that_comes_much_too_late_does_not_begin_a_new_track(session, pushes, walk):
-    bodies = pushes()
-    delayed = bodies.pop(20)
-    take(session, [*bodies[:60], delayed, *bodies[60:]])
-    assert session.track.samples == len(walk) - 20
-    assert session.status()["dropped"] == {"late": 40}
-    assert any("dropped (40 late)" in word["text"] for word in session.status()["health"])
-    assert len(list(session.track.path.parent.glob("*.csv"))) == 1
-
-
-def test_a_delayed_push_does_not_bring_back_the_recording_before(session, pushes):
-    first = pushes(seconds=3.0)
-    second = pushes(session="two", offset_ns=10**18 + 10**10, seconds=3.0)
-    take(session, [*first[:-1], second[0], first[-1], *second[1:]])
-    assert session.track.samples == 300
-    assert session.status()["dropped"] == {"late": 40}
-    assert len(list(session.track.path.parent.glob("*.csv"))) == 2
-
-
-def test_a_clock_that_was_set_back_within_a_recording_begins_a_new_track(session, pushes):
-    bodies = pushes(seconds=6.0)
-    take(session, [*bodies[:15], *pushes(seconds=6.0, offset_ns=10**18 - 10**11)[15:]])
-    assert session.track.samples == 300
-    assert session.status()["dropped"] == {}
-
-
 def test_what_waits_is_processed_when_the_track_ends(session, pushes):
     bodies = pushes(seconds=4.0)
     take(session, [*bodies[:-2], bodies[-1]])
@@ -229,9 +200,26 @@ def test_a_reading_with_a_wild_time_is_dropped_alone(session, pushes, seconds):
     assert 798 <= session.track.samples <= 800
 
 
-def test_a_recording_that_begins_with_an_empty_push_begins_a_new_track(session, pushes):
-    empty = b'{"messageId": 0, "sessionId": "two", "deviceId": "phone", "payload": []}'
-    second = pushes(session="two", offset_ns=10**18 + 10**10, seconds=4.0)[1:]
-    take(session, [*pushes(seconds=3.0), empty, *second])
-    assert session.track.samples == 380
-    assert len(list(session.track.path.parent.glob("*.csv"))) == 2
+EMPTY = b'{"messageId": 0, "sessionId": "two", "deviceId": "phone", "payload": []}'
+
+
+@pytest.mark.parametrize(
+    ("order", "samples", "dropped", "tracks"),
+    [
+        # A push that comes much too late begins no new track.
+        (lambda one, two, back: [*one[:20], *one[21:61], one[20], *one[61:]], 1981, 40, 1),
+        # A delayed push does not bring back the recording before.
+        (lambda one, two, back: [*one[:14], two[0], one[14], *two[1:15]], 300, 40, 2),
+        # A clock that was set back within a recording begins a new track.
+        (lambda one, two, back: [*one[:15], *back[15:30]], 300, 0, 2),
+        # So does a recording that begins with an empty push.
+        (lambda one, two, back: [*one[:15], EMPTY, *two[1:20]], 380, 0, 2),
+    ],
+)
+def test_late_pushes_and_other_recordings(session, pushes, order, samples, dropped, tracks):
+    second, back = pushes(session="two", offset_ns=10**18 + 10**10), 10**18 - 10**11
+    take(session, order(pushes(), second, pushes(offset_ns=back)))
+    assert session.track.samples == samples
+    assert session.status()["dropped"] == ({"late": dropped} if dropped else {})
+    assert any(f"({dropped} late" in w["text"] for w in session.status()["health"]) == (dropped > 0)
+    assert len(list(session.track.path.parent.glob("*.csv"))) == tracks

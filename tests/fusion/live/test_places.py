@@ -13,21 +13,17 @@ from starlette.testclient import TestClient
 from stario.fusion import Navigator, NavigatorConfig, PlaceConfig
 from stario.fusion.live.hub import Hub, Viewer
 from stario.fusion.live.server import live_app
-from stario.sequences import read_recording
-from stario.sequences.geodesy import Georeference
+from stario.sequences import Georeference, read_recording
 from stario.sequences.sequence import FloatArray
 
 from .conftest import SteadyWalk, added, command, rerun, send
 
 PLACE = Georeference(48.1, 11.5)
 TILES = "http://tiles.example:81/{z}/{x}/{y}.png"
-Where = Callable[[float], Any]
 
 
 @pytest.fixture
-def make_client(
-    tmp_path,
-) -> Iterator[Callable[..., tuple[TestClient, Hub, Callable[[], Navigator]]]]:
+def make_client(tmp_path):
     hubs = []
 
     def make(tiles: str = "", **place: Any) -> Any:
@@ -42,7 +38,7 @@ def make_client(
         hub.close()
 
 
-def with_places(bodies, xy: Where, **values: float) -> Iterator[bytes]:
+def with_places(bodies, xy: Callable[[float], Any], **values: float) -> Iterator[bytes]:
     """Pushes with a place in every fifth, once a second, at metres from `PLACE`."""
 
     def place(time: float) -> dict[str, float]:
@@ -87,9 +83,7 @@ def test_used_places_put_the_track_where_a_run_of_its_recording_does(make_client
         np.testing.assert_allclose([x, y], east(time), atol=0.02)
 
 
-def test_compared_places_lie_on_the_track_that_they_fit_and_change_nothing(
-    make_client, pushes
-) -> None:
+def test_compared_places_lie_on_the_track_and_change_nothing(make_client, pushes) -> None:
     client, hub, _ = make_client()
     send(client, pushes(seconds=13.0))
     plain = np.array(hub.sessions["phone"].track.drawn.points)
@@ -154,20 +148,14 @@ def test_a_track_on_the_earth_keeps_its_zero_there(make_client, pushes) -> None:
     assert hub.sessions["phone"].track.drawn.origin.tolist() == [0.0, 0.0, 0.0]
 
 
-def test_the_map_has_tiles_where_the_track_lies_once_it_is_on_the_earth(
-    make_client, pushes
-) -> None:
+def test_the_map_has_tiles_where_the_track_lies(make_client, pushes) -> None:
     client, *_ = make_client(TILES, satellites="use")
     sides = {"left": -100, "right": 100, "bottom": -50, "top": 50}
     assert client.get("/background", params=sides).json() == []
     send(client, with_places(pushes(seconds=4.0), east))
     images = client.get("/background", params=sides).json()
-    [over] = [
-        image
-        for image in images
-        if image["x"] <= 0.0 < image["x"] + image["sizex"]
-        and image["y"] - image["sizey"] < 0.0 <= image["y"]
-    ]
+    columns = [each for each in images if each["x"] <= 0.0 < each["x"] + each["sizex"]]
+    [over] = [each for each in columns if each["y"] - each["sizey"] < 0.0 <= each["y"]]
     zoom, x, y = map(int, over["source"].removesuffix(".png").split("/")[-3:])
     assert over["source"].startswith("http://tiles.example:81/")
     assert x == int(2**zoom * (11.5 / 360.0 + 0.5))

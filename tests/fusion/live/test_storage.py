@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import signal
-import threading
-import time
-import urllib.request
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stario.fusion import read_fixes
+from stario.fusion import position_fix, read_fixes
 from stario.fusion.live import storage
 from stario.fusion.live import track as track_module
 from stario.fusion.live.payload import GYRO, parse_push
 from stario.fusion.live.session import Session
 from stario.fusion.live.storage import LiveFile
-from stario.fusion.values.fixes import position_fix
 from stario.sequences import InputError, read_recording
 
 from .conftest import full_disk
 
-SAMPLES = [
-    (10**18 + k * 10**7, (0.1 * k, 1 / 3, -2e-5), (1 / 7, 0.01 * k, 9.80665)) for k in range(40)
-]
+VALUES = [((0.1 * k, 1 / 3, -2e-5), (1 / 7, 0.01 * k, 9.80665)) for k in range(40)]
+SAMPLES = [(10**18 + k * 10**7, *pair) for k, pair in enumerate(VALUES)]
 
 
 def test_recording_reads_back_exactly_while_it_is_open(tmp_path):
@@ -44,10 +36,9 @@ def test_recording_reads_back_exactly_while_it_is_open(tmp_path):
 
 
 def test_recordings_begun_in_the_same_second_do_not_overwrite_each_other(tmp_path):
-    files = [LiveFile(tmp_path, "phone") for _ in range(3)]
-    assert len({file.path for file in files}) == 3
-    for file in files:
-        file.close()
+    with ExitStack() as stack:
+        files = [stack.enter_context(closing(LiveFile(tmp_path, "phone"))) for _ in range(3)]
+        assert len({file.path for file in files}) == 3
 
 
 def test_recording_truncated_at_any_byte_keeps_every_complete_sample(tmp_path, caplog):
@@ -65,34 +56,6 @@ def test_recording_truncated_at_any_byte_keeps_every_complete_sample(tmp_path, c
         # Once the last column's comma is written, the line's data are complete.
         assert len(recording) - whole in (0, 1)
         np.testing.assert_array_equal(recording.accel, [a for _, _, a in SAMPLES[: len(recording)]])
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
-def test_a_killed_server_leaves_all_samples_that_it_acknowledged(tmp_path, pushes, process):
-    server, url = process
-    acknowledged = 0
-    for body in pushes(seconds=4.0):
-        request = urllib.request.Request(url, body, {"content-type": "application/json"})
-        with urllib.request.urlopen(request) as answer:
-            acknowledged += json.load(answer)["samples"]
-    sender = threading.Thread(target=_push_on, args=(url, pushes(seconds=8.0)[20:]))
-    sender.start()
-    time.sleep(0.3)
-    os.kill(server.pid, signal.SIGKILL)
-    server.wait()
-    sender.join()
-    (path,) = tmp_path.glob("*.csv")
-    recording = read_recording(path)
-    assert len(recording) >= acknowledged >= 380
-    assert (np.diff(recording.time) > 0).all()
-
-
-def _push_on(url, bodies):
-    for body in bodies:
-        try:
-            urllib.request.urlopen(urllib.request.Request(url, body), timeout=5).close()
-        except OSError:
-            return
 
 
 class NearlyFull:
@@ -159,9 +122,7 @@ def test_a_gyroscope_in_another_unit_is_shown_though_the_track_begins_again(sess
     assert all(shown[first:])
 
 
-def test_a_full_disk_is_shown_until_it_has_space_and_a_push_may_be_repeated(
-    session, batches, monkeypatch
-):
+def test_a_full_disk_is_shown_until_it_has_space(session, batches, monkeypatch):
     for batch in batches[:10]:
         session.take(batch, 1.7e9)
     append = LiveFile.append
@@ -197,16 +158,24 @@ def test_a_recording_that_never_gives_a_position_says_why(session, batches):
             readings = [replace(r, time_ns=r.time_ns + late) for r in batch.readings]
             session.take(replace(batch, readings=readings, number=k + n), 1.7e9)
     assert session.track.drawn.points == []
-    assert session.status()["problem"].startswith("no position so far")
-    assert any("gaps in the samples" in word["text"] for word in session.status()["health"])
+    assert "no position" in session.status()["problem"]
+    assert any("gaps" in word["text"] for word in session.status()["health"])
 
 
-def test_an_accelerometer_too_slow_to_interpolate_is_named(session, batches):
-    for batch in batches[:25]:
-        accel = [r for r in batch.readings if r.sensor != GYRO][:1]  # 5 Hz
-        gyro = [r for r in batch.readings if r.sensor == GYRO]
-        session.take(replace(batch, readings=gyro + accel), 1.7e9)
-    assert "log both at 50 Hz" in session.status()["problem"]
+@pytest.mark.parametrize(
+    ("kept", "words"),
+    [
+        (lambda k, r: r.sensor == GYRO or r.time_ns % (10**9 // 5) == 0, "log both at 50 Hz"),
+        (lambda k, r: r.sensor != GYRO or k < 15, "no samples of gyroscope for 5 s"),
+    ],
+)
+def test_a_sensor_that_is_slow_or_stops_is_shown(session, batches, kept, words):
+    for k, batch in enumerate(batches):
+        if k == 15 and "gyroscope" in words:
+            assert session.status()["problem"] == ""
+        readings = [reading for reading in batch.readings if kept(k, reading)]
+        session.take(replace(batch, readings=readings), 1.7e9)
+    assert words in session.status()["problem"]
 
 
 def test_an_unwritable_folder_is_shown(tmp_path, new_navigator, batches):
@@ -214,16 +183,6 @@ def test_an_unwritable_folder_is_shown(tmp_path, new_navigator, batches):
     session = Session("phone", tmp_path / "file", new_navigator)
     assert session.take(batches[0], 1.7e9) == 0
     longer = replace(batches[1], readings=[r for batch in batches[1:9] for r in batch.readings])
-    with pytest.raises(InputError, match="a writable folder"):
+    with pytest.raises(InputError, match="writable"):
         session.take(longer, 1.7e9)
     assert "a writable folder" in session.status()["problem"]
-
-
-def test_a_gyroscope_that_stops_is_shown(session, batches):
-    for batch in batches[:15]:
-        session.take(batch, 1.7e9)
-    assert session.status()["problem"] == ""
-    for batch in batches[15:]:
-        others = [reading for reading in batch.readings if reading.sensor != GYRO]
-        session.take(replace(batch, readings=others), 1.7e9)
-    assert "no samples of gyroscope for 5 s" in session.status()["problem"]

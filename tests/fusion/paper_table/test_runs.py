@@ -1,6 +1,5 @@
 """Runs of the table: completed once, resumed after a kill; only new ones are completed later."""
 
-import csv
 import json
 import os
 import pickle
@@ -31,10 +30,8 @@ from stario.fusion.paper_table.table import completed_runs, set_table
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import ModelRow
+from stario.sequences import ConfigError, InputError, WeightsError, read_recording, write_csv
 from stario.sequences.datasets.batch import each
-from stario.sequences.errors import ConfigError, InputError, WeightsError
-from stario.sequences.readers import read_recording
-from stario.sequences.readers.csv_writer import write_csv
 
 RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
 
@@ -95,9 +92,7 @@ def assert_complete(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
-    dataset, reading, tmp_path, monkeypatch
-):
+def test_only_new_networks_and_seeds_are_trained(dataset, reading, tmp_path, monkeypatch):
     trained = []
     original = runs_module.train_run
 
@@ -129,13 +124,11 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
-    dataset, reading, tmp_path
-):
+def test_runs_of_another_recipe_are_refused(dataset, reading, tmp_path):
     done = run(dataset, steps=1)
     complete_run(done, tmp_path, reading)
     other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
-    with pytest.raises(ConfigError, match=r"tested\.json.*another recipe"):
+    with pytest.raises(ConfigError, match=r"tested\.json.*recipe"):
         complete_run(other, tmp_path, reading)
     assert completed_runs([run(dataset, steps=2)], tmp_path) == {}
 
@@ -175,8 +168,7 @@ def test_new_weights_or_changed_recordings_do_not_keep_old_results(dataset, monk
     before = given.digest, run(dataset).digest
     with monkeypatch.context() as patch:
         patch.setattr(runs_module, "_weights_sha256", lambda name: "new")
-        assert given.digest != before[0]
-        assert run(dataset).digest == before[1]
+        assert (given.digest != before[0], run(dataset).digest) == (True, before[1])
     os.utime(dataset.training[0])  # as if it were written again
     assert (given.digest, run(dataset).digest != before[1]) == (before[0], True)
     os.utime(dataset.test[0].path)
@@ -190,14 +182,13 @@ def test_an_unknown_backend_is_refused():
         pass
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_writes_tables_and_figures(dataset, tmp_path, monkeypatch):
     folder = dataset.training[0].parent
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
     costs = [ModelRow("DeepILS", 2_290_754, 15_287_000, {"torch": {"1": 1.0, "64": 0.5}}, 11.2)]
-    surveyed = "stario.fusion.paper_table.table.survey"  # measuring is slow, and so is rendering
+    surveyed = "stario.fusion.paper_table.table.survey"  # measuring is slow
     monkeypatch.setattr(surveyed, lambda names: costs if names == ["DeepILS"] else [])
-    saved = "stario.fusion.evaluation.results.save_figure"
-    monkeypatch.setattr(saved, lambda figure, path: path.touch())
     (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
     out = tmp_path / "out"
     arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]
@@ -206,22 +197,13 @@ def test_the_command_writes_tables_and_figures(dataset, tmp_path, monkeypatch):
     assert done.exit_code == 0, done.output
     text = (out / "table.md").read_text()
     assert text in done.output
-    for words in (
-        "1 training steps of 6 windows",
-        "| DeepILS | 2.291 (",
-        "`pdr`",
-        "4.374, 3.665",
-        "core hours",
-    ):
+    for words in ("1 training steps of 6 windows", "| DeepILS | 2.291 (", "4.374, 3.665"):
         assert words in text
-    with (out / "table.csv").open() as file:
-        assert [row["network"] for row in csv.DictReader(file)] == [
-            "pdr", "DeepILS", "default",
-        ]  # fmt: skip
+    assert pd.read_csv(out / "table.csv")["network"].to_list() == ["pdr", "DeepILS", "default"]
     content = json.loads((out / "table.json").read_text())["sets"]["ronin"]
     assert (content["training"], content["validation"], content["tested"]) == (2, 1, 1)
     figures = {path.name for path in (out / "ronin/figures").glob("*.png")}
     assert figures == {"ate_parameters.png", "distributions.png", "pde.png", "trajectories.png"}
-    clash = ["check", "table", "--out", str(out), "--set", f"a={folder}", "--set", f"a={folder}"]
-    with pytest.raises(InputError, match="a name of its own"):
+    clash = f"check table --out {out} --set a={folder} --set a={folder}".split()
+    with pytest.raises(InputError, match="name"):
         CliRunner().invoke(app, clash, catch_exceptions=False)

@@ -28,13 +28,13 @@ NOTHING = "nothing"
          "split the recording"),
         (GOOD | {"samples": {"used": 900, "duplicate": 100}}, ["samples_dropped"], "",
          "the same rate"),
-        (GOOD | {"gated": 30}, ["network_contradicts"], "", "signs are right, the weights"),
-        (GOOD | {"mean_nis": 12.0}, ["network_sigma"], "", "a factor of about 2.0"),
+        (GOOD | {"gated": 30}, ["network_contradicts"], "", "signs"),
+        (GOOD | {"mean_nis": 12.0}, ["network_sigma"], "", "about 2.0"),
         (GOOD | {"mean_nis": 7.0, "network_error_level": 25.0}, ["network_sigma"], "", "5.0 times"),
-        (GOOD | {"mean_nis": 0.8}, [], "network_sigma",
-         "does not mean that the track's sigmas are too large"),
-        (GOOD | {"final_sigma": {"yaw_rad": 1.0}}, ["yaw_unknown"], "",
-         "six times their sigma apart"),
+        (GOOD | {"mean_nis": 0.8}, [], "network_sigma", "does not mean"),
+        (GOOD | {"final_sigma": {"yaw_rad": 1.0}}, ["yaw_unknown"], "", "sigma apart"),
+        (GOOD | {"longest_late": 0.4}, [], NOTHING, ""),
+        (GOOD | {"longest_late": 0.6}, [], "samples_late", ""),
         # After a few windows nothing is said about the motion, but rest is as good.
         ({"updates": 2, "gated": 2, "mean_nis": 0.04}, [], "too_early", ""),
         ({"zero_velocity": {"applied": 300}}, [], NOTHING, ""),
@@ -43,15 +43,13 @@ NOTHING = "nothing"
         (TURNED | {"network_turn_sigma": 0.5}, [], NOTHING, ""),
         (GOOD | {"network_turn": 0.3, "network_turn_sigma": 0.01}, [], NOTHING, ""),
         (SHAKEN, ["samples_flagged", "network_contradicts"], "",
-         "cannot be trusted: the device was shaken or struck beyond its sensors' range (3 spike, "
-         "9 saturated samples), and 17%"),
+         "cannot be trusted"),
         (SHAKEN | {"flagged": {"spike": 1}}, ["network_contradicts"], "", ""),
         (SHAKEN | {"gated": 3}, ["samples_flagged"], "", ""),
         (GOOD | {"fixes": {"applied": 3, "gated": 1}}, ["fixes"], "", "frame"),
         (GOOD | {"fixes": {"applied": 30, "gated": 1}}, [], "fixes", ""),
         # One stands with a receiver: two positions that are apart are still to come.
-        (GOOD | {"fixes": {"applied": 2, "yaw not known": 580}}, [], "fixes",
-         "six times their sigma apart"),
+        (GOOD | {"fixes": {"applied": 2, "yaw not known": 580}}, [], "fixes", "sigma apart"),
         (GOOD | {"bearings": {"no horizontal field": 120}}, [], "field_useless", ""),
         (GOOD | {"bearings": {"applied": 100, "gated": 90, "no horizontal field": 2}}, [], NOTHING,
          ""),
@@ -82,11 +80,6 @@ def test_standing_still_is_advised_only_where_the_yaw_drifts(gap, yaw_sigma, hel
     health = Health(**GOOD, longest_gap=gap, final_sigma={"yaw_rad": yaw_sigma})
     (found,) = (each for each in findings(health) if each.code == "yaw_unknown")
     assert ("still" in found.advice) == helps
-
-
-def test_samples_late_for_a_moment_are_not_worth_a_note() -> None:
-    late = [findings(Health(longest_late=seconds)) for seconds in (0.4, 0.6)]
-    assert ["samples_late" in [f.code for f in found] for found in late] == [False, True]
 
 
 @pytest.mark.slow

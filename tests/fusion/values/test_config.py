@@ -5,12 +5,12 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from stario.fusion.values.config import UPDATE_RATES, FilterConfig, NavigatorConfig, read_config
-from stario.sequences.errors import ConfigError, StarioError
+from stario.fusion.values.config import FilterConfig, NavigatorConfig, read_config
+from stario.sequences import ConfigError, ImuNoise, StarioError
 from stario.sequences.files import write_json
-from stario.sequences.noise import ImuNoise
 from stario.sequences.settings import with_settings
 
+NAN = float("nan")
 TOML = """
 gravity = 9.81
 [filter]
@@ -21,11 +21,16 @@ gyro_noise = 1e-3
 """
 
 
-def test_toml_sets_the_named_fields_and_keeps_the_other_defaults(tmp_path):
-    path = tmp_path / "slow.toml"
-    path.write_text(TOML)
-    default, config = NavigatorConfig(), read_config(path)
-    assert config == replace(
+FILTER = {"update_rate": 5, "covariance_scale": 2}
+VALUES = {"gravity": 9.81, "filter": FILTER, "noise": {"gyro_noise": 1e-3}}
+
+
+@pytest.mark.parametrize("name", ["slow.toml", "SLOW.TOML", "slow.json", "SLOW.JSON"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_file_sets_the_named_fields_and_keeps_the_other_defaults(tmp_path, name, encoding):
+    path, default = tmp_path / name, NavigatorConfig()
+    path.write_text(TOML if "toml" in name.lower() else json.dumps(VALUES), encoding=encoding)
+    assert read_config(path) == replace(
         default,
         gravity=9.81,
         noise=replace(default.noise, gyro_noise=1e-3),
@@ -33,26 +38,13 @@ def test_toml_sets_the_named_fields_and_keeps_the_other_defaults(tmp_path):
     )
 
 
-def test_json_and_toml_give_the_same_configuration(tmp_path):
-    values = {"gravity": 9.8, "filter": {"gate": 0.99}}
-    (tmp_path / "a.json").write_text(json.dumps(values))
-    (tmp_path / "a.toml").write_text("gravity = 9.8\n[filter]\ngate = 0.99\n")
-    assert read_config(tmp_path / "a.json") == read_config(tmp_path / "a.toml")
-    (tmp_path / "empty.toml").write_text("")
-    assert read_config(tmp_path / "empty.toml") == NavigatorConfig()
-    for name in ("a.json", "a.toml"):
-        marked = tmp_path / f"MARKED{name[1:].upper()}"
-        marked.write_text((tmp_path / name).read_text(), encoding="utf-8-sig")
-        assert read_config(marked) == read_config(tmp_path / name)
-
-
 def test_a_saved_configuration_reads_back_equal(tmp_path):
-    config = NavigatorConfig(
-        noise=ImuNoise(1e-3, 0.123456789012345, 3e-5, 2e-3),
-        filter=FilterConfig(update_rate=20, gate=0.99),
-    )
+    noise = ImuNoise(1e-3, 0.123456789012345, 3e-5, 2e-3)
+    config = NavigatorConfig(noise=noise, filter=FilterConfig(update_rate=20, gate=0.99))
     write_json(tmp_path / "config.json", asdict(config))
     assert read_config(tmp_path / "config.json") == config
+    (tmp_path / "empty.toml").touch()
+    assert read_config(tmp_path / "empty.toml") == NavigatorConfig()
 
 
 @pytest.mark.parametrize(
@@ -68,9 +60,8 @@ def test_a_saved_configuration_reads_back_equal(tmp_path):
         ({"filter": {"gate": 1.0}}, "filter.gate"),
         ({"filter": {"covariance_scale": 0.0}}, "filter.covariance_scale"),
         ({"filter": {"yaw_sigma": -1.0}}, "filter.yaw_sigma"),
-        ({"filter": {"declination": 4.0}}, "filter.declination"),
-        ({"graph": {"lag": 0.5}}, "graph.lag"),
-        ({"graph": {"lag": float("nan")}}, "graph.lag"),
+        *(({"filter": {"declination": value}}, "filter.declination") for value in (4.0, NAN, "E")),
+        *(({"graph": {"lag": value}}, "graph.lag") for value in (0.5, 100.0, NAN)),
         ({"noise": {"accel_noise": float("inf")}}, "noise.accel_noise"),
         ({"gravity": 0.98}, "gravity"),
     ],
@@ -85,10 +76,10 @@ def test_an_invalid_setting_is_refused_by_name_in_one_line(values, named):
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("broken.toml", b"[filter\n"),
-        ("broken.json", b"{"),
-        ("list.json", b"[1, 2]"),
-        ("binary.toml", b"\xff\xfe\x00"),
+        ("a.toml", b"[filter\n"),
+        ("a.json", b"{"),
+        ("b.json", b"[1, 2]"),
+        ("b.toml", b"\xff\xfe\x00"),
     ],
 )
 def test_a_malformed_file_is_named_in_one_line(tmp_path, name, content):
@@ -104,14 +95,6 @@ def test_a_malformed_file_is_named_in_one_line(tmp_path, name, content):
 def test_an_invalid_setting_in_a_file_is_named_with_the_file(tmp_path):
     path = tmp_path / "device.toml"
     path.write_text("[noise]\ngyro = 1e-3\n")
-    with pytest.raises(ConfigError, match="an unknown key") as caught:
+    with pytest.raises(ConfigError, match="unknown") as caught:
         read_config(path)
     assert caught.value.field == f"{path}: noise.gyro"
-
-
-@pytest.mark.parametrize("rate", UPDATE_RATES)
-def test_updates_coincide_with_states_and_overlap_inflates_the_covariance(rate):
-    config = FilterConfig(update_rate=rate, covariance_scale=1.0)
-    assert config.intervals_per_update * rate == config.output_rate >= 10
-    assert config.window_updates == rate
-    assert config.overlap_scale == pytest.approx(rate)

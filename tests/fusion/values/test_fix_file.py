@@ -6,46 +6,22 @@ import pytest
 from stario.fusion.values.fix_file import check_within, read_fixes
 from stario.fusion.values.fixes import position_fix
 from stario.fusion.values.floors import FloorChange, floor_at, floor_changes
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError, ReadError
 
 HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
 
-def test_a_file_of_fixes_is_read(tmp_path):
-    path = tmp_path / "fixes.csv"
-    path.write_text(
-        HEADER + "1.5,position,1,2,3,0.1,,0.3\n\n2,yaw,0.7,,,0.05,,\n3, velocity,1,0,0,0.2\n",
-        encoding="utf-8",
-    )
-    position, yaw, velocity = read_fixes(path)
-    assert (position.kind, yaw.kind, velocity.kind) == ("position", "yaw", "velocity")
-    assert (position.time, yaw.time) == (1.5, 2.0)
-    np.testing.assert_allclose(position.value, [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(position.covariance, np.diag([0.01, 0.01, 0.09]))
-    np.testing.assert_allclose(yaw.covariance, [[0.0025]])
-
-
 def test_a_folder_or_a_missing_file_is_no_file_of_fixes(tmp_path):
-    with pytest.raises(ReadError, match="file: found is a directory, expected a readable file"):
-        read_fixes(tmp_path)
-    with pytest.raises(ReadError, match="fixes"):
-        read_fixes(tmp_path / "fixes.csv")
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
-def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path, encoding):
-    path = tmp_path / "fixes.csv"
-    table = "t,kind,x,y,sx,,\n1.5,position,1,2,0.1,,\n2,yaw,0.7,,0.05,,\n,,,,,\xa0,\n"
-    path.write_bytes(table.replace(",", "\t").encode(encoding))
-    assert [fix.kind for fix in read_fixes(path)] == ["position", "yaw"]
+    for path, named in ((tmp_path, "directory"), (tmp_path / "fixes.csv", "fixes")):
+        with pytest.raises(ReadError, match=named):
+            read_fixes(path)
 
 
 @pytest.mark.parametrize(
     ("text", "match"),
     [
         ("", "no lines"),
-        (HEADER + "1,yaw [deg],17,,,500,,\n", r"yaw: found 17 \+- 500, expected radians$"),
+        (HEADER + "1,yaw [deg],17,,,500,,\n", "yaw.*17.*500.*radians$"),
         ("time,kind\n", "line 1.*header"),
         (HEADER + "1,altitude,1,2,3,1,,\n", "line 2, kind.*altitude"),
         (HEADER + "1,position,1,2,3,1,,\nx,position,1,2,3,1,,\n", "line 3, t"),
@@ -58,12 +34,12 @@ def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path, encoding):
         (HEADER + "1,position,1,2,3,0,,\n", "sigma.*> 0"),
         (HEADER + "1,position,1,2,nan,1,,\n", "line 2, z.*nan"),
         (HEADER + "1,position,1,2,3,1,1,1,1\n", "9 values"),
-        (HEADER.strip() + ",note\n1,position,1,2,3,1,1,1,a\n", "line 1.*unknown column 'note'"),
+        (HEADER.strip() + ",note\n1,position,1,2,3,1,1,1,a\n", "line 1.*unknown.*'note'"),
         ("t,kind,x,y\n1,position,1,2\n", "line 1.*no column 'sx'"),
-        ("t,kind,x,y,y,sx\n1,position,1,2,2,1\n", "line 1.*two columns 'y'"),
+        ("t,kind,x,y,y,sx\n1,position,1,2,2,1\n", "line 1.*two.*'y'"),
         ("# mine\n\n" + HEADER + "# a, b\n1,position,1,2,3,0,,\n", "line 5, sigma"),
         ("# mine\n", "line 1: found nothing"),
-        (HEADER + "\n", "a header only, expected at least one fix"),
+        (HEADER + "\n", "header only"),
     ],
 )
 def test_an_invalid_file_raises_an_error_that_names_line_and_field(tmp_path, text, match):
@@ -75,34 +51,38 @@ def test_an_invalid_file_raises_an_error_that_names_line_and_field(tmp_path, tex
     assert "\n" not in str(caught.value)
 
 
-def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path):
+PLAIN = "t,kind,x,y,z,sx,sy,sz\n5.5,position,1,-2,3,0.1,,0.3\n\n6,yaw,0.5,,,0.05,,\n"
+LAYOUTS = {
+    "short last row": PLAIN.removesuffix(",,\n"),
+    "blank cells": PLAIN.replace("\n", ",\xa0\n").replace("\xa0\n", "\n", 1) + ",,,,,\xa0,,,\n",
+    "any order": "Kind;t [s];z;x;y;sz;sx\nposition;5.5;3;1;-2;0.3;0.1\nyaw;6;;0.5;;;0.05\n",
+    "degrees": PLAIN.replace("yaw,0.5,,,0.05", f"yaw[deg],{np.degrees(0.5)},,,{np.degrees(0.05)}"),
+    "decimal commas": PLAIN.replace(",", ";").replace(".", ",").replace(";6;", ";6,0;"),
+    "comments": "# my fixes; two\n" + PLAIN.replace("6,", " # second\n6,"),
+    "commas and tabs": PLAIN.replace(",", "\t").replace(".", ","),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_of_a_table_gives_the_same_fixes(tmp_path, layout, encoding):
     path = tmp_path / "fixes.csv"
-    rows = [
-        "# from the plan",
-        "Kind;t [s];x;y;z;sx",
-        "position;1;2;3;;0.5",
-        "# 2",
-        "yaw[deg];2;170;;;5",
-    ]
-    path.write_text("\n".join(rows))
+    path.write_text(LAYOUTS[layout], encoding=encoding)
     position, yaw = read_fixes(path)
-    np.testing.assert_allclose(position.value, [2.0, 3.0, 0.0])
-    assert position.covariance[0, 0] == pytest.approx(0.25)
-    assert position.covariance[2, 2] == pytest.approx(1e6)
-    np.testing.assert_allclose(yaw.value, [np.radians(170.0)])
-    np.testing.assert_allclose(yaw.covariance, [[np.radians(5.0) ** 2]])
+    assert [(fix.kind, fix.time) for fix in (position, yaw)] == [("position", 5.5), ("yaw", 6.0)]
+    np.testing.assert_allclose(position.value, [1.0, -2.0, 3.0])
+    np.testing.assert_allclose(position.covariance, np.diag([0.01, 0.01, 0.09]))
+    np.testing.assert_allclose(yaw.value, [0.5])
+    np.testing.assert_allclose(yaw.covariance, [[0.0025]])
 
 
-@pytest.mark.parametrize("separator", [";", "\t"])
-def test_decimal_commas_are_read(tmp_path, separator):
-    lines = ["t;kind;x;y;sx", "5,0;position;0,5;-1;1,5", "20;position;3;4,25;1e0"]
+def test_a_velocity_and_a_position_without_height_are_read(tmp_path):
     path = tmp_path / "fixes.csv"
-    path.write_text("\n".join(lines).replace(";", separator))
-    first, second = read_fixes(path)
-    assert (first.time, second.time) == (5.0, 20.0)
-    np.testing.assert_allclose(first.value, [0.5, -1.0, 0.0])
-    np.testing.assert_allclose(second.value, [3.0, 4.25, 0.0])
-    assert first.covariance[0, 0] == pytest.approx(2.25)
+    path.write_text("t,kind,x,y,z,sx\n1,position,2,3,,0.5\n3, velocity,1,0,0,0.2\n")
+    position, velocity = read_fixes(path)
+    np.testing.assert_allclose(position.value, [2.0, 3.0, 0.0])
+    np.testing.assert_allclose(position.covariance, np.diag([0.25, 0.25, 1e6]))
+    assert velocity.kind == "velocity"
 
 
 @pytest.mark.parametrize("by", [-100.0, 100.0])
@@ -110,12 +90,9 @@ def test_fixes_before_or_after_the_recording_are_on_another_clock(by):
     time, zero = np.arange(101) / 10.0, np.zeros((101, 3))
     sequence = ImuSequence("walk", time, zero, zero)
     fixes = [position_fix(at + by, np.zeros(3), np.eye(3)) for at in (2.0, 4.0)]
-    with pytest.raises(InputError, match=r"fixes: found times from .* expected some within"):
+    with pytest.raises(InputError, match=r"fixes.*within"):
         check_within(fixes, sequence)
     check_within([*fixes, position_fix(5.0, np.zeros(3), np.eye(3))], sequence)
-
-
-# --- floors ---------------------------------------------------------------------------------------
 
 
 DRIFT = 0.3
@@ -150,10 +127,7 @@ def test_landings_are_no_floors():
         assert [(c.before, c.after) for c in changes] == [(0, 1)]
 
 
-def test_a_level_walk_a_ramp_and_a_doorstep_are_one_floor():
-    for legs in ([(300, 0.0, 1.2)], [(60, 2.0, 1.2)], [(30, 0, 1.2), (3, 0.6, 1.0), (30, 0, 1.2)]):
+def test_a_level_walk_a_ramp_a_doorstep_and_two_seconds_are_one_floor():
+    doorstep = [(30, 0, 1.2), (3, 0.6, 1.0), (30, 0, 1.2)]
+    for legs in ([(300, 0.0, 1.2)], [(60, 2.0, 1.2)], doorstep, [(2, 0, 1.0)]):
         assert found(*legs) == ([], 0.0)
-
-
-def test_too_short_a_track_has_no_floors():
-    assert found((2.0, 0.0, 1.0)) == ([], 0.0)

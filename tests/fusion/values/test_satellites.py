@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import support
 
-from stario.fusion import Navigator, Track, position_fix
-from stario.fusion.values.config import PlaceConfig
+from stario.fusion import Navigator, PlaceConfig, Track, position_fix
 from stario.fusion.values.satellites import satellite_fixes
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.geodesy import Georeference
@@ -92,9 +91,6 @@ def test_a_velocity_without_a_direction_is_none(speed, bearing):
     assert {fix.kind for fix in found.fixes} == {"position"}
 
 
-# --- tracks ----------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def walk(make_walk):
     """A walk whose receiver is wrong by the same 4 m, and gives velocities in its second half."""
@@ -134,10 +130,8 @@ def test_a_track_with_satellites_lies_on_the_map_from_its_start(walk, model):
 
 def test_satellites_that_are_not_used_change_nothing(walk, model):
     short = walk.slice(0.0, 10.0)
-    plain, without = (
-        Navigator(model, support.GRAPH).run(each)
-        for each in (short, replace(short, satellites=None))
-    )
+    navigator, blind = Navigator(model, support.GRAPH), replace(short, satellites=None)
+    plain, without = (navigator.run(each) for each in (short, blind))
     np.testing.assert_array_equal(plain.trajectory.position_W, without.trajectory.position_W)
     assert plain.georeference is None
 
@@ -169,16 +163,10 @@ def test_metres_beside_degrees_need_an_origin(walk, model):
     assert track.georeference == PLACE
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"satellites": "always"},
-        {"waypoints": "ignore"},
-        {"origin": (11.5, 948.1)},
-        {"origin": (48.1,)},
-        {"closed": "yes"},
-    ],
-)
-def test_an_unknown_use_or_place_is_refused(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        PlaceConfig(**wrong)
+WRONG = {"satellites": "always", "waypoints": "ignore", "origin": (48.1,), "closed": "yes"}
+
+
+@pytest.mark.parametrize(("name", "value"), [*WRONG.items(), ("origin", (11.5, 948.1))])
+def test_an_unknown_use_or_place_is_refused(name, value):
+    with pytest.raises(ConfigError, match=name):
+        PlaceConfig(**{name: value})

@@ -17,21 +17,13 @@ from stario.fusion.evaluation.checks.consistency import (
     summary,
 )
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.sequences import PHONE_IMU, ImuNoise, InputError
 from stario.sequences.accuracy.nees import nees_bounds
-from stario.sequences.errors import InputError
-from stario.sequences.noise import ImuNoise
-from stario.sequences.simulation.imu import PHONE_IMU
 
 # Initial errors of metres per second and degrees of yaw interact beyond first order.
 CONFIG = NavigatorConfig(noise=ImuNoise(), filter=FilterConfig(velocity_sigma=0.1))
-PHONE = NavigatorConfig(
-    noise=PHONE_IMU.noise,
-    filter=FilterConfig(
-        velocity_sigma=0.1,
-        gyro_bias_sigma=PHONE_IMU.gyro_turn_on,
-        accel_bias_sigma=PHONE_IMU.accel_turn_on,
-    ),
-)
+BIASES = {"gyro_bias_sigma": PHONE_IMU.gyro_turn_on, "accel_bias_sigma": PHONE_IMU.accel_turn_on}
+PHONE = NavigatorConfig(noise=PHONE_IMU.noise, filter=FilterConfig(velocity_sigma=0.1, **BIASES))
 
 
 def averages(config: NavigatorConfig, runs: int = 20, seconds: float = 300.0) -> SimpleNamespace:

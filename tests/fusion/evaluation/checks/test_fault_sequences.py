@@ -8,8 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from stario.fusion import Navigator, NavigatorConfig, NavState
-from stario.fusion.values.config import FilterConfig
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, NavState
 from stario.sequences.errors import InputError
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))
@@ -41,18 +40,14 @@ FAULTS = (
     *(*FIXES, "restored"),
 )
 
-WALK = st.lists(
-    st.tuples(st.sampled_from(FAULTS), st.integers(1, 60), st.floats(-1.0, 1.0)),
-    min_size=3,
-    max_size=12,
-)
+FAULT = st.tuples(st.sampled_from(FAULTS), st.integers(1, 60), st.floats(-1.0, 1.0))
+WALK = st.lists(FAULT, min_size=3, max_size=12)
 
 
 class FaultyNetwork:
     """A network whose predictions depend on the current fault."""
 
-    def __init__(self) -> None:
-        self.fault, self.size = "", 0.0
+    fault, size = "", 0.0
 
     def predict(self, windows):
         n = len(windows)
@@ -139,12 +134,7 @@ def assert_valid(state: NavState) -> None:
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 @pytest.mark.parametrize("examples", [6, pytest.param(200, marks=pytest.mark.slow)])
 def test_no_sequence_of_faults_breaks_a_stream(backend, examples):
-    @settings(
-        max_examples=examples,
-        deadline=None,
-        derandomize=True,
-        suppress_health_check=list(HealthCheck),
-    )
+    @settings(max_examples=examples, suppress_health_check=list(HealthCheck))
     @given(WALK)
     def run(walk):
         stream = Stream(backend)

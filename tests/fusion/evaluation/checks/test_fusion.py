@@ -6,9 +6,11 @@ from itertools import count
 import numpy as np
 import pandas as pd
 import pytest
-from support import CONFIG
+from support import CONFIG, lying
 
+from stario.fusion import Health, Navigator, NavigatorConfig, Track
 from stario.fusion.evaluation.checks import fusion
+from stario.fusion.evaluation.checks.faults import run_faults
 from stario.fusion.evaluation.checks.fusion import (
     end_shift_table,
     end_shifts,
@@ -19,15 +21,10 @@ from stario.fusion.evaluation.checks.fusion import (
     track_with_fixes,
     true_fixes,
 )
+from stario.fusion.evaluation.checks.moments import moment_costs
 from stario.fusion.evaluation.scores import joined, scored, values
-from stario.fusion.navigator import Navigator
-from stario.fusion.values.config import NavigatorConfig
-from stario.fusion.values.health import Health
-from stario.fusion.values.state import Track
 from stario.network.model import load_model
-from stario.sequences.attitude.rotations import about_z
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import PositionTrack, Trajectory
+from stario.sequences import InputError, PositionTrack, Trajectory, about_z
 
 
 def of(scores: pd.DataFrame, metric: str, track: str = "filtered") -> float:
@@ -36,9 +33,8 @@ def of(scores: pd.DataFrame, metric: str, track: str = "filtered") -> float:
 
 
 def row(name: str, group: str, ratio: float, network: float, **fused: float) -> pd.DataFrame:
-    return scored(
-        name, {"network": {"error_m": network}, "filtered": {"ratio": ratio, **fused}}, group
-    )
+    figures = {"network": {"error_m": network}, "filtered": {"ratio": ratio, **fused}}
+    return scored(name, figures, group)
 
 
 def test_ratios_are_geometric_means_by_group():
@@ -94,12 +90,10 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(walk, ma
     walk = walk.slice(0.0, 10.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     turn, truth = about_z(2.0), walk.truth
-    other = replace(
-        truth, position_W=turn.apply(truth.position_W), attitude_WB=turn * truth.attitude_WB
-    )
-    found, rotated = (
-        fusion_gain(oracle, replace(walk, truth=each), CONFIG) for each in (truth, other)
-    )
+    position_W, attitude_WB = turn.apply(truth.position_W), turn * truth.attitude_WB
+    other = replace(truth, position_W=position_W, attitude_WB=attitude_WB)
+    worlds = (replace(walk, truth=each) for each in (truth, other))
+    found, rotated = (fusion_gain(oracle, world, CONFIG) for world in worlds)
     assert of(rotated, "yaw_error") == pytest.approx(of(found, "yaw_error"), abs=1e-9)
     assert abs(of(found, "yaw_error")) < 0.1
     track = Navigator(oracle, CONFIG, backend="ekf").run(walk)
@@ -110,36 +104,36 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(walk, ma
     assert of(shorter, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[at_its_end, 2, 2]))
 
 
+@pytest.mark.parametrize(
+    "score",
+    [fusion_gain, track_with_fixes, moment_costs, lambda model, *rest: run_faults(*rest)],
+)
+def test_a_recording_without_truth_is_refused(walk, still_model, score):
+    with pytest.raises(InputError, match="truth"):
+        score(still_model, walk.without_truth(), CONFIG)
+
+
 def test_what_cannot_be_scored_is_refused(walk, still_model):
-    for score in (fusion_gain, track_with_fixes):
-        with pytest.raises(InputError, match="truth"):
-            score(still_model, walk.without_truth(), CONFIG)
     with pytest.raises(InputError, match="fixes"):
         track_with_fixes(still_model, walk, CONFIG, every=15.0)
     # A group's mean would be NaN with a single waypoint within the track.
     at_waypoints = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
-    with pytest.raises(InputError, match="fewer than 2 within the track"):
+    with pytest.raises(InputError, match="fewer than 2"):
         fusion_gain(still_model, replace(walk, truth=None, positions=at_waypoints), CONFIG)
-    force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
     with pytest.raises(InputError, match="metre"):
-        end_shifts(still_model, replace(walk, gyro=0.0 * force, accel=force, truth=None), CONFIG)
+        end_shifts(still_model, lying(20.0), CONFIG)
 
 
 def test_errors_and_sigmas_are_those_of_the_second_half(walk, still_model, monkeypatch):
     """A track that is lost at first, then off by (0.3, 0.4, 0) m and 0.02 rad."""
     truth = walk.truth
     off = np.where(truth.time > truth.time[-1] / 2.0, 1.0, 100.0)
-    trajectory = replace(
-        truth,
-        position_W=truth.position_W + np.outer(off, [0.3, 0.4, 0.0]),
-        attitude_WB=about_z(0.02) * truth.attitude_WB,
-    )
+    position_W = truth.position_W + np.outer(off, [0.3, 0.4, 0.0])
+    attitude_WB = about_z(0.02) * truth.attitude_WB
+    trajectory = replace(truth, position_W=position_W, attitude_WB=attitude_WB)
     variances = [1.0, 1.0, 0.01**2, *[9.0] * 3, *[0.5**2] * 3, *[4.0] * 6]
-    track = Track(
-        trajectory,
-        covariance=np.tile(np.diag(variances), (len(truth), 1, 1)),
-        health=Health(fixes={"applied": 3}),
-    )
+    covariance = np.tile(np.diag(variances), (len(truth), 1, 1))
+    track = Track(trajectory, covariance=covariance, health=Health(fixes={"applied": 3}))
     monkeypatch.setattr(Navigator, "run", lambda *arguments, **options: track)
     scores = track_with_fixes(still_model, walk, CONFIG, every=5.0)
     [found] = scores.itertuples()
@@ -194,10 +188,8 @@ def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees(still_model, walk,
     """Three ends: the unmodified one, one 0.5 m and 20 degrees off, the others not at all."""
     time, position = np.arange(3.0), np.outer(np.arange(3.0), [5.0, 0.0, 0.0])
     turned = about_z(np.radians([0.0, 10.0, -20.0]))
-    straight, other = (
-        Track(Trajectory(time, position + shift, attitude))
-        for shift, attitude in (([0.0, 0.0, 0.0], about_z(np.zeros(3))), ([0.3, 0.4, 9.0], turned))
-    )
+    straight = Track(Trajectory(time, position, about_z(np.zeros(3))))
+    other = Track(Trajectory(time, position + np.array([0.3, 0.4, 9.0]), turned))
     runs = iter([straight, other, *[straight] * 6])
     monkeypatch.setattr(Navigator, "run", lambda *arguments: next(runs))
     scores = end_shifts(still_model, walk, NavigatorConfig())

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from stario.fusion import NavigatorConfig, Track
 from stario.fusion.evaluation.checks import moments
 from stario.fusion.evaluation.checks.moments import largest_correction, moment_costs, moment_table
 from stario.fusion.evaluation.checks.simulation import (
@@ -20,8 +21,6 @@ from stario.fusion.evaluation.checks.simulation import (
     simulated_walk,
 )
 from stario.fusion.evaluation.scores import joined, scored, values
-from stario.fusion.values.config import NavigatorConfig
-from stario.fusion.values.state import Track
 from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -49,30 +48,20 @@ def test_the_table_counts_small_ratios_and_small_corrections():
     assert lines[3].split()[0] == "all"
 
 
-def test_a_fall_beyond_the_sensors_range_makes_no_correction_of_a_metre(monkeypatch):
-    monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["drop"],))
-    monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
-    walk = simulate_imu(generate_walk(2, 20.0), 200.0, ImuErrors(), 2)
-    found = moment_costs(load_model(), walk, NavigatorConfig())
-    assert (values(found, "step") < 1.0).all()
-
-
 def test_a_step_that_the_velocity_does_not_explain_is_a_correction(walk):
     time = np.arange(0.0, 5.0, 0.1)
     true = walk.truth.at(time)
     late = time > 2.0
     velocity = np.gradient(true.position_W, time, axis=0)
-    moved = replace(
-        true, velocity_W=velocity, position_W=true.position_W + late[:, None] * [0.0, 3.0, 0.0]
-    )
+    position_W = true.position_W + late[:, None] * [0.0, 3.0, 0.0]
+    moved = replace(true, velocity_W=velocity, position_W=position_W)
     turned = replace(moved, attitude_WB=about_z(0.5 * late) * true.attitude_WB)
     zero = np.zeros((len(time), 3))
     step, turn = largest_correction(walk, Track(moved, b_g=zero))
     assert step == pytest.approx(3.0, abs=0.1)
     assert turn < 2.0  # errors of the gyroscope
-    assert largest_correction(walk, Track(turned, b_g=zero))[1] == pytest.approx(
-        np.degrees(0.5), abs=2.0
-    )
+    _, turn = largest_correction(walk, Track(turned, b_g=zero))
+    assert turn == pytest.approx(np.degrees(0.5), abs=2.0)
     in_gap = replace(turned, valid=time != time[late][0])
     step, turn = largest_correction(walk, Track(in_gap, b_g=zero))
     assert step < 0.1
@@ -90,18 +79,29 @@ def test_errors_are_those_of_each_part_and_of_both_as_one():
     assert np.isnan(moments._errors(truth[:2], estimate[:2], before[:2])[0])
 
 
-def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, monkeypatch):
-    monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["table"],))
-    monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
-    [found] = moment_costs(load_model(), walk, NavigatorConfig()).itertuples()
+@pytest.fixture
+def costs(monkeypatch):
+    """What the moment of a name costs in the middle of a recording."""
+
+    def of(name, recording):
+        monkeypatch.setattr(moments, "MOMENTS", (BY_NAME[name],))
+        monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
+        [found] = moment_costs(load_model(), recording, NavigatorConfig()).itertuples()
+        return found
+
+    return of
+
+
+def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, costs):
+    found = costs("table", walk)
     assert (found.group, found.track) == ("table, middle", "filtered")
     assert 0.0 < found.error_with < 2.0 * found.error_without
     assert 0.0 < found.step_without < moments.MAX_STEP
 
 
-def test_a_recording_without_known_positions_is_refused(walk):
-    with pytest.raises(InputError, match="truth"):
-        moment_costs(object(), walk.without_truth(), NavigatorConfig())
+def test_a_fall_beyond_the_sensors_range_makes_no_correction_of_a_metre(costs):
+    walk = simulate_imu(generate_walk(2, 20.0), 200.0, ImuErrors(), 2)
+    assert costs("drop", walk).step < 1.0
 
 
 MEASURED = {
