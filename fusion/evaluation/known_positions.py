@@ -32,10 +32,11 @@ from stario.sequences.sequence import (
 MIN_POSITIONS = 2
 """Minimum number of positions: a shift alone fits one; with two, their distance is compared."""
 
-_COURSE_S, _WAY_S = 10.0, 1.0
+_COURSE_S, _WAY_S = (10.0, 5.0, 3.0), 1.0
 """Times [s] over which distances between positions are compared with the track's: the first tells
-the course whatever the windings of either, the second the way along them. With positions of
-uncertainty sigma they are at least four times as many seconds, in which a walker moves as far."""
+the course whatever the windings of either, as long as the room allows, the second the way along
+them. With positions of uncertainty sigma they are at least four times as many seconds, in which a
+walker moves as far."""
 
 _MIN_CHORDS, _RESTING_M_S = 5, 0.2
 """Least number of such distances, and speed [m/s] below which one is rest."""
@@ -232,11 +233,12 @@ def _scale(
 ) -> list[Finding]:
     """Compare the lengths of both ways, of their course and along their windings."""
     least = 4.0 * (known.typical_sigma or 0.0)
-    course, way = ratios = [
+    *courses, way = (
         _length_ratio(time, truth, estimate, max(seconds, least), least)
-        for seconds in (_COURSE_S, _WAY_S)
-    ]
-    if not (np.min(ratios) > _SCALED or np.max(ratios) < 1.0 / _SCALED):  # nor if one is NaN
+        for seconds in (*_COURSE_S, _WAY_S)
+    )
+    course = next((ratio for ratio in courses if math.isfinite(ratio)), math.nan)
+    if not (min(course, way) > _SCALED or max(course, way) < 1.0 / _SCALED):  # nor if one is NaN
         return []
     text = f"The {known.kind} say that the way is {way:.2g} times as long as the track."
     advice = "These weights do not know this motion or carrying: rely on no length of the track."
