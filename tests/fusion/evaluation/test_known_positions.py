@@ -156,6 +156,16 @@ def test_positions_contradict_by_length_and_handedness_alone(walk_and_track, cha
     assert position_findings(track, few) == []
 
 
+def test_in_a_room_where_no_chord_of_ten_seconds_is_long_the_way_is_compared_too(walk_and_track):
+    walk, track = walk_and_track
+    circles = np.column_stack([np.cos(track.time / 0.75), np.sin(track.time / 0.75)])
+    position = np.column_stack([0.2 * circles, np.zeros(len(track.time))])
+    short = replace(track, trajectory=replace(track.trajectory, position_W=position))
+    known = PositionTrack(track.time, 0.6 * circles, "positions")
+    found = position_findings(short, replace(walk, truth=None, positions=known))
+    assert [f.values["scale"] for f in found if f.code == "track_scale"] == [pytest.approx(3.0)]
+
+
 @pytest.mark.parametrize(("degrees", "codes"), [(30.0, []), (163.0, ["network_direction"])])
 def test_a_walk_taken_backwards_is_told_by_true_attitudes(walk_and_track, degrees, codes):
     """Its shape fits after a turn; only where the device faces says that the turn is wrong."""
