@@ -42,20 +42,40 @@ class Georeference:
                 raise InputError(f"georeference: {name}", f"{value:g}", wanted)
 
     def xy(self, latlon_deg: FloatArray) -> FloatArray:
-        """Return metres (N, 2) in the map's axes for latitudes and longitudes (N, 2) [deg]."""
+        """Return metres (N, 2) in the map's axes for latitudes and longitudes (N, 2) [deg].
+
+        Raises:
+            InputError: they have another shape; a single place is one row.
+        """
+        latitude, longitude = _columns("latlon_deg", latlon_deg)[:2]
         east, north, _ = pymap3d.geodetic2enu(
-            latlon_deg[:, 0], latlon_deg[:, 1], 0.0, self.latitude_deg, self.longitude_deg, 0.0
+            latitude, longitude, 0.0, self.latitude_deg, self.longitude_deg, 0.0
         )
         return turned(np.column_stack([east, north]), -self.yaw)
 
     def latlon_deg(self, position_W: FloatArray) -> FloatArray:
-        """Return latitudes and longitudes (N, 2) [deg] of positions (N, 2 or 3) [m] in the map."""
-        east, north = turned(position_W[:, :2], self.yaw).T
+        """Return latitudes and longitudes (N, 2) [deg] of positions (N, 2 or 3) [m] in the map.
+
+        Raises:
+            InputError: they have another shape; a single position is one row.
+        """
+        east, north = turned(_columns("position_W", position_W)[:2].T, self.yaw).T
         # The plane leaves the ellipsoid: at 10 km by 8 m, which moves no point sideways.
         latitude, longitude, _ = pymap3d.enu2geodetic(
             east, north, np.zeros_like(east), self.latitude_deg, self.longitude_deg, 0.0
         )
         return np.column_stack([latitude, (longitude + 180.0) % 360.0 - 180.0])
+
+
+def _columns(field: str, rows: FloatArray) -> FloatArray:
+    """Return the columns (2 or 3, N) of rows."""
+    try:
+        columns = np.atleast_2d(np.asarray(rows, np.float64)).T
+    except (TypeError, ValueError):
+        raise InputError(field, f"{rows!r:.60}", "numbers (N, 2)") from None
+    if columns.ndim != 2 or len(columns) not in (2, 3):
+        raise InputError(field, f"shape {np.shape(rows)}", "(N, 2)")
+    return columns
 
 
 def east_north(latlon_deg: FloatArray) -> FloatArray:

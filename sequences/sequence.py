@@ -253,13 +253,21 @@ class ImuSequence:
         return replace(self, truth=None, positions=None)
 
     def slice(self, start: float, stop: float) -> ImuSequence:
-        """Return the samples with start <= time <= stop [s], and all other data within them."""
+        """Return the samples with start <= time <= stop [s], and all other data within them.
+
+        Raises:
+            InputError: there are none.
+        """
+        inside = (self.time >= start) & (self.time <= stop)
+        if not inside.any():
+            found, has = f"{start:g} to {stop:g} s", f"{self.time[0]:g} to {self.time[-1]:g} s"
+            raise InputError("slice", found, f"times within the recording's, {has}")
         parts = {name: getattr(self, name) for name in _PARTS}
         # Unlike `Trajectory.slice`, that of `Timed` returns None if nothing is left.
         rest: dict[str, Any] = {
             name: Timed.slice(part, start, stop) for name, part in parts.items() if part is not None
         }
-        return replace(self.select((self.time >= start) & (self.time <= stop)), **rest)
+        return replace(self.select(inside), **rest)
 
     def select(self, keep: BoolArray | NDArray[np.intp]) -> ImuSequence:
         """Return the recording with samples `keep` only: (N,) bool, or indices in their order."""

@@ -174,3 +174,4 @@ def test_positions_come_back_from_latitude_and_longitude(latitude, yaw):
     latlon = place.latlon_deg(np.column_stack([xy, [0.0, 12.0, -3.0]]))
     assert (np.abs(latlon[:, 1]) <= 180.0).all()
     np.testing.assert_allclose(place.xy(latlon), xy, atol=1e-3)
+    np.testing.assert_allclose(place.xy(latlon[1]), xy[1:2], atol=1e-3)
