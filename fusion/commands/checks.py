@@ -156,11 +156,11 @@ def consistency(
 
 def benchmark(as_json: options.Json = False) -> None:
     """Measure the speed of run, filter and stream on this machine; `models` has the networks'."""
-    from stario.fusion.evaluation.checks.speed import speed
+    from stario.fusion.evaluation.checks.speed import speed, speed_text
     from stario.network.model import load_model
 
     found = speed(load_model("default"))
-    common.print_result(as_json, found.to_dict(), found.to_string(float_format="%.3g"))
+    common.print_result(as_json, found.to_dict(), speed_text(found))
 
 
 @options.expanded

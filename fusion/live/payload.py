@@ -54,6 +54,7 @@ taken to be wrong; more are a backlog."""
 MAX_READING = 1e4
 """Maximum reading of any sensor in rad/s, m/s^2 or uT."""
 
+_AS_LINES = "send lines of JSON with the content type application/x-ndjson"
 _MAX_TIME_NS = 2**63
 _MAX_NAME_LENGTH = 80
 _NORM_TOLERANCE = 0.05
@@ -122,11 +123,14 @@ def parse_push(body: bytes) -> Batch:
     Raises:
         InputError: the body does not have this form; the error names the field.
     """
-    message = object_from("body", body)
+    try:
+        message = object_from("body", body)
+    except InputError as error:  # perhaps because it is several lines
+        fix = _AS_LINES if body.strip().count(b"\n") else ""
+        raise InputError(error.field, error.found, error.expected, fix) from None
     payload = message.get("payload")
     if not isinstance(payload, list):
-        lines = "send lines of JSON with the content type application/x-ndjson"
-        fix = lines if payload is None else ""
+        fix = _AS_LINES if payload is None else ""
         raise InputError("payload", _describe(payload), "a list of samples", fix)
     if len(payload) > MAX_ENTRIES:
         found = f"{len(payload)} samples"

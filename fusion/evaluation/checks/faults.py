@@ -210,7 +210,9 @@ def run_faults(
             rng, preprocessed = np.random.default_rng(seed), whole
             try:
                 if fault.modify_samples is not None:
-                    preprocessed = observed(fault.modify_samples(sequence, rng))
+                    spoilt = fault.modify_samples(sequence, rng)
+                    named = f"{sequence.name}, {fault.name}"  # in warnings of what was injected
+                    preprocessed = observed(replace(spoilt, name=named))
                 if fault.modify_predictions is not None:
                     preprocessed = _corrupted(preprocessed, fault.modify_predictions, rng)
                 track = navigator.track(preprocessed)

@@ -19,6 +19,18 @@ from stario.sequences.sequence import ImuSequence
 _RUNS, _RATES = 3, (2, 10, 20)
 """Number of runs of which the median counts, and update rates of the filter alone [Hz]."""
 
+_WORDS = {
+    "run_s_per_min": "s per minute of data: run",
+    **{f"filter_{n}_hz_s_per_min": f"s per minute of data: filter at {n} Hz" for n in _RATES},
+    "push_us": "us: push without a state (median)",
+    "push_with_update_us": "us: push with an update by the network (99th percentile)",
+}
+
+
+def speed_text(found: pd.Series[float]) -> str:
+    """Return what `speed` found in words."""
+    return "\n".join(f"{found[name]:9.3g} {words}" for name, words in _WORDS.items())
+
 
 def speed(model: Predictor) -> pd.Series[float]:
     """Time a run of the demonstration, the filter alone at several update rates, and its samples.

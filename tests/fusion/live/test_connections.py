@@ -166,8 +166,9 @@ def test_posted_lines_are_accepted_all_or_none(client, hub, walk):
     assert (broken.status_code, hub.sessions) == (400, {})
     assert broken.json()["error"].startswith("line 51")
     assert hub.refused == 1
-    unnamed = client.post("/data", content=posted[0])
-    assert "application/x-ndjson" in unnamed.json()["error"]
+    for text in (posted[0], "\n".join(posted[:3])):
+        unnamed = client.post("/data", content=text)
+        assert "application/x-ndjson" in unnamed.json()["error"]
     assert send_lines(client, posted).json() == {"samples": 150}
 
 
