@@ -114,7 +114,8 @@ def simulate(
     carry: str = typer.Option(
         "random",
         help="How the device is carried: handheld, in-front, texting, call, swinging, pocket, "
-        "back-pocket, bag, trolley, rig, or random, which also draws the person. On a body: "
+        "back-pocket, bag, trolley, rig; or random, which draws the person, too, and neither "
+        "trolley nor rig. On a body: "
         "front-pocket, back-pocket, belt, jacket, bag, swinging, wrist, ear, head, in-front, "
         "foot, or random.",
     ),
@@ -161,7 +162,7 @@ def simulate(
         style, field = _style(carry), INDOOR_FIELD if magnetometer else None
         check_amount(seconds or 60.0, rate)
         # Without a barometer stairs are read twice too long: README.md, "Limits".
-        walk = generate_walk(seed, seconds or 60.0, style=style, level=True)
+        walk = generate_walk(seed, seconds or 60.0, style=style, plain=True)
         sequence = simulate_imu(walk, rate, errors, seed, name=name, magnetic_field=field)
     length = 0.0 if sequence.truth is None else sequence.truth.path_length()
     write_csv(path, sequence)

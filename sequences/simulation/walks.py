@@ -19,7 +19,7 @@ from stario.sequences.attitude.stacks import composed
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.settings import check_number
-from stario.sequences.simulation.carrying import CARRYING_MODES, carry_motion, drawn_person
+from stario.sequences.simulation.carrying import CARRYING_MODES, PLACES, carry_motion, drawn_person
 from stario.sequences.simulation.routes import RISER, Route, drift, integral, random_route, smoothed
 from stario.sequences.simulation.strides import CarryMotion, Gait, StrideCycle, step_rate
 
@@ -92,13 +92,16 @@ _ODDS = (0.16, 0.07, 0.07, 0.08, 0.14, 0.08, 0.06, 0.1, 0.1, 0.14)
 """Probability of each carrying mode, in the order of `CARRYING_MODES`."""
 
 
+_OF_PHONES = {*PLACES, ""}
+
+
 def generate_walk(
     seed: int,
     duration: float = 60.0,
     rate: float = 100.0,
     style: WalkStyle | None = None,
     corridors: bool = False,
-    level: bool = False,
+    plain: bool = False,
 ) -> Trajectory:
     """Generate the trajectory of a carried device.
 
@@ -108,7 +111,8 @@ def generate_walk(
         rate: rate of the poses [Hz], minimum 50, so that harmonics are not aliased.
         style: person and carrying mode; None draws them.
         corridors: whether to walk along the corridors of a floor instead of anywhere.
-        level: whether to take no stairs, which an IMU alone does not notice.
+        plain: whether to take no stairs, which an IMU alone does not notice, and to draw neither a
+            trolley nor a rig, whose ways the weights do not know.
 
     Returns:
         Poses of the device in a world frame whose origin is the start on the floor.
@@ -122,10 +126,12 @@ def generate_walk(
         raise InputError("rate", repr(rate), "a finite rate of at least 50 Hz")
     check_amount(duration, rate)
     rng = generator(seed)
-    style = WalkStyle.random(rng) if style is None else style
+    drawn = style is None
+    while style is None or (drawn and plain and not {style.carry, style.next_carry} <= _OF_PHONES):
+        style = WalkStyle.random(rng)
     count = round(duration * rate) + 1
     wheels = style.carry == "trolley"
-    route = random_route(rng, count, rate, style.preferred_speed, wheels, corridors, level)
+    route = random_route(rng, count, rate, style.preferred_speed, wheels, corridors, plain)
     return carried_along(rng, route, rate, style)
 
 

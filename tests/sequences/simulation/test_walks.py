@@ -32,6 +32,13 @@ def test_a_hundred_walks_cover_the_styles():
     assert 10 < sum(bool(style.next_carry) for style in styles) < 60
 
 
+@pytest.mark.parametrize("seed", [5, 14, 17, 21])  # of trolleys, if they are drawn
+def test_a_plain_walk_is_that_of_a_phone_on_a_person(seed):
+    for plain, least, most in ((True, 0.01, 2.0), (False, 0.0, 0.005)):
+        bounce = np.ptp(generate_walk(seed, 30.0, plain=plain).position_W[:, 2])
+        assert least < bounce < most
+
+
 TRACK = generate_walk(3, 20.0)
 SIMULATED = {
     "walk": lambda seed: simulate_imu(generate_walk(seed, 10.0), errors=PERFECT_IMU),
