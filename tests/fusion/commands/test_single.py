@@ -25,12 +25,21 @@ from stario.sequences.conventions import with_axes
 from stario.sequences.readers.generic_csv import read_generic_csv
 
 COMMANDS = "run live compare evaluate inspect convert train simulate export check"
+CHECKS = ("models", "table", "fusion", "moments", "heights", "simulation", "fixes", "benchmark")
 
 
 def test_help_names_every_command():
     result = CliRunner().invoke(app, ["--help"])
     assert result.exit_code == 0
     assert re.findall(r"^│ (\w+)", result.output, flags=re.MULTILINE) == COMMANDS.split()
+
+
+@pytest.mark.parametrize("command", [*COMMANDS.split(), *(f"check {name}" for name in CHECKS)])
+def test_every_command_prints_its_help(command):
+    result = CliRunner().invoke(app, [*command.split(), "--help"], terminal_width=200)
+    assert result.exit_code == 0
+    assert f"{command} [OPTIONS]" in result.output
+    assert " . " not in result.output  # left if the formatter drops a word in brackets
 
 
 @pytest.mark.parametrize(
