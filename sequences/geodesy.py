@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pymap3d
 
+from stario.sequences.arrays import as_float64
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
@@ -70,9 +71,9 @@ class Georeference:
 def _columns(field: str, rows: FloatArray) -> FloatArray:
     """Return the columns (2 or 3, N) of rows."""
     try:
-        columns = np.atleast_2d(np.asarray(rows, np.float64)).T
-    except (TypeError, ValueError):
-        raise InputError(field, f"{rows!r:.60}", "numbers (N, 2)") from None
+        columns = np.atleast_2d(as_float64(field, rows)).T
+    except InputError as error:
+        raise InputError(field, error.found, "numbers (N, 2)") from None
     if columns.ndim != 2 or len(columns) not in (2, 3):
         raise InputError(field, f"shape {np.shape(rows)}", "(N, 2)")
     return columns

@@ -26,7 +26,7 @@ _BETTER = 3.0
 recordings. On 261 of seven sets it refuses two axes swapped on 80 %, a cycle of three on 95 % and
 one sign changed on 44 %; the others hardly tilt."""
 
-LEAST_PIECES = 3
+_LEAST_PIECES = 3
 """Number of pieces of 4 s below which nothing is judged: within 5 s of good walks other axes left
 less than a third of the change."""
 
@@ -69,7 +69,7 @@ def check_changes(field: str, changes: Sequence[FloatArray]) -> None:
     Raises:
         InputError: other axes and signs leave several times less than those given.
     """
-    if len(changes) < LEAST_PIECES:
+    if len(changes) < _LEAST_PIECES:
         return
     change = np.mean(changes, axis=0)
     best = int(change.argmin())

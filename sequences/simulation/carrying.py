@@ -111,8 +111,8 @@ def _trolley(gait: Gait) -> CarryMotion:
     speed = np.clip(gait.speed[:, None] / _RUMBLE_SPEED, 0.0, 2.0)
     offset, turn = np.zeros((n, 3)), 0.004 * drift(rng, n, gait.rate, 0.8, 3)
     for low, high, power, accel, rate in _RUMBLE:
-        if low > 0.4 * gait.rate:
-            break
+        if high > 0.5 * gait.rate:
+            break  # the poses cannot hold it
         noise = floor * speed**power * band_noise(rng, n, gait.rate, low, high, 6)
         to_angle = 1.0 / (2.0 * np.pi * math.sqrt(low * high))
         offset += to_angle**2 * noise[:, :3] * accel

@@ -124,9 +124,8 @@ def simulate_house(
         raise InputError("duration", f"{duration:g} s", f"at least {SHORTEST:g} s")
     check_amount(duration, max(rate, _RATE))
     rng = generator(seed, _STREAM)
-    drawn = style is None
-    while style is None or (drawn and style.carry == "trolley"):
-        style = WalkStyle.random(rng)
+    if style is None:
+        style = WalkStyle.random(rng, without=("trolley",))
     if style.carry == "trolley":
         raise InputError("carry", "trolley", "a device that a person carries on stairs")
     place = replace(PLACE, yaw=PLACE.yaw - float(rng.uniform(-np.pi, np.pi)))

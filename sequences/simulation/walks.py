@@ -8,6 +8,7 @@ person (`strides`), who walks slowly with short steps rather than with few.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from stario.sequences.attitude.stacks import composed
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.settings import check_number
-from stario.sequences.simulation.carrying import CARRYING_MODES, PLACES, carry_motion, drawn_person
+from stario.sequences.simulation.carrying import CARRYING_MODES, carry_motion, drawn_person
 from stario.sequences.simulation.routes import RISER, Route, drift, integral, random_route, smoothed
 from stario.sequences.simulation.strides import CarryMotion, Gait, StrideCycle, step_rate
 
@@ -69,18 +70,25 @@ class WalkStyle:
             raise InputError("mount_rotvec", repr(mount), "three finite angles [rad]")
 
     @staticmethod
-    def random(rng: np.random.Generator) -> WalkStyle:
-        """Draw a person and a carrying mode (about a third of walks change it)."""
-        carry = str(rng.choice(CARRYING_MODES, p=_ODDS))
-        # A device is not put onto a trolley, or taken off it, within a step or two.
-        others = [mode for mode in CARRYING_MODES if mode not in (carry, "trolley")]
-        changes = carry != "trolley" and rng.random() < 1.0 / 3.0
-        return WalkStyle(
-            carry=carry,
-            next_carry=str(rng.choice(others)) if changes else "",
-            height=float(np.clip(rng.normal(1.72, 0.1), 1.45, 2.0)),
-            preferred_speed=float(np.clip(rng.normal(1.05, 0.3), 0.5, 1.8)),
-        )
+    def random(rng: np.random.Generator, without: Collection[str] = ()) -> WalkStyle:
+        """Draw a person and a carrying mode, none of `without` (about a third of walks change)."""
+        style = _drawn_style(rng)
+        while style.carry in without or style.next_carry in without:
+            style = _drawn_style(rng)
+        return style
+
+
+def _drawn_style(rng: np.random.Generator) -> WalkStyle:
+    carry = str(rng.choice(CARRYING_MODES, p=_ODDS))
+    # A device is not put onto a trolley, or taken off it, within a step or two.
+    others = [mode for mode in CARRYING_MODES if mode not in (carry, "trolley")]
+    changes = carry != "trolley" and rng.random() < 1.0 / 3.0
+    return WalkStyle(
+        carry=carry,
+        next_carry=str(rng.choice(others)) if changes else "",
+        height=float(np.clip(rng.normal(1.72, 0.1), 1.45, 2.0)),
+        preferred_speed=float(np.clip(rng.normal(1.05, 0.3), 0.5, 1.8)),
+    )
 
 
 _RANGES = (
@@ -91,8 +99,8 @@ _RANGES = (
 _ODDS = (0.16, 0.07, 0.07, 0.08, 0.14, 0.08, 0.06, 0.1, 0.1, 0.14)
 """Probability of each carrying mode, in the order of `CARRYING_MODES`."""
 
-
-_OF_PHONES = {*PLACES, ""}
+_NO_PHONES = ("trolley", "rig")
+"""Carrying modes whose ways the weights do not know."""
 
 
 def generate_walk(
@@ -112,7 +120,7 @@ def generate_walk(
         style: person and carrying mode; None draws them.
         corridors: whether to walk along the corridors of a floor instead of anywhere.
         plain: whether to take no stairs, which an IMU alone does not notice, and to draw neither a
-            trolley nor a rig, whose ways the weights do not know.
+            trolley nor a rig.
 
     Returns:
         Poses of the device in a world frame whose origin is the start on the floor.
@@ -126,9 +134,8 @@ def generate_walk(
         raise InputError("rate", repr(rate), "a finite rate of at least 50 Hz")
     check_amount(duration, rate)
     rng = generator(seed)
-    drawn = style is None
-    while style is None or (drawn and plain and not {style.carry, style.next_carry} <= _OF_PHONES):
-        style = WalkStyle.random(rng)
+    if style is None:
+        style = WalkStyle.random(rng, without=_NO_PHONES if plain else ())
     count = round(duration * rate) + 1
     wheels = style.carry == "trolley"
     route = random_route(rng, count, rate, style.preferred_speed, wheels, corridors, plain)
