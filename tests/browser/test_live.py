@@ -115,7 +115,7 @@ def test_a_walk_with_satellites_lies_on_the_map(show, tile_server, replay, tmp_p
         shown.page.locator("#map image").first.wait_for(state="attached")
         shown.page.get_by_text("east [m]").wait_for()
         shown.page.get_by_text("map: 127.0.0.1").wait_for()
-        loaded = "performance.getEntriesByType('resource').some(e => e.name.endsWith('.png'))"
+        loaded = "() => performance.getEntriesByType('resource').some(e => e.name.endsWith('.png'))"
         shown.page.wait_for_function(loaded)
         drawn = "window.stario.devices.get('fred').places.length"
         assert shown.page.evaluate(drawn) == len(server.hub.sessions["fred"].track.places.drawn) > 8

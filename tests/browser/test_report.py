@@ -178,7 +178,7 @@ def test_a_map_server_is_asked_on_request_and_points_have_their_place(
     found = Comparison(sequence, {"track": track}, comparison.metrics)
     shown = show(write_report(tmp_path / "r.html", found, tile_server).as_uri())
     assert shown.problems == []
-    shown.page.wait_for_function("document.querySelectorAll('#map image').length > 0")
+    shown.page.wait_for_function("() => document.querySelectorAll('#map image').length > 0")
     assert all(re.fullmatch(r"/\d+/\d+/\d+\.png", path) for path in Tiles.asked)
     line = shown.page.evaluate(
         "document.getElementById('map').data.find(t => t.legendgroup === 'track' && t.customdata)"
