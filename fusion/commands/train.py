@@ -151,10 +151,14 @@ def train(
         common.list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
-    with common.training_progress(recipe.steps, shown=is_leader()) as progress:
-        path = train_network(
-            recipe, material, held, out, progress, _print_epoch, first, calibration
-        )
+    try:
+        with common.training_progress(recipe.steps, shown=is_leader()) as progress:
+            path = train_network(
+                recipe, material, held, out, progress, _print_epoch, first, calibration
+            )
+    except KeyboardInterrupt:
+        typer.echo(f"stopped; the same command goes on from the last epoch in {out}", err=True)
+        raise
     if is_leader():
         typer.echo(str(path))
         if skipped:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -39,6 +40,8 @@ from stario.sequences.files import atomic_write
 from stario.sequences.geodesy import turned
 from stario.sequences.sequence import ImuSequence
 
+log = logging.getLogger(__name__)
+
 _DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 1, "nees_median": 1, "nis_mean": 1}
 """Decimals of the table's columns."""
 
@@ -69,6 +72,11 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     # Beside a true track, those are drawn in its frame, whose place is not known.
     place = found.georeference if truth is None else None
+    if tiles and place is None:
+        why = (
+            "beside a true track" if truth else "where on the earth it lies is not known: --origin"
+        )
+        log.warning("%s: no tiles in the report (%s)", sequence.name, why)
     yaw = 0.0 if place is None else place.yaw
     series = {
         name: track_series(moved(aligned, yaw, np.zeros(3), np.zeros(3)), start, found.tracks[name])

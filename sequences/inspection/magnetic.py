@@ -74,6 +74,9 @@ _NO_FIELD_UT = 1e-9
 _HALF_SECOND, _TURNED_RAD = 0.5, 0.05
 """Half seconds in which the field turns by more than this in the sensor's axes are examined."""
 
+_COVERED = 0.9
+"""Share of a recording's seconds with a field below which the summary says how many there are."""
+
 
 def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
     """Assess up to ten minutes of the magnetometer; None if there is none or too little.
@@ -121,6 +124,8 @@ def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
         "levelled_bearing_rms_rad": spread,
         "gyroscope_drift_rad_s": drift,
         "held_share": _held(stamps, values),
+        "covered_s": float(len(np.unique(np.floor(field.time - sequence.time[0])))),
+        "recording_s": sequence.duration,
     }
     figures["verdict"] = _verdict(figures)
     return Assessment(figures, _lines(figures), _findings(figures, certain))
@@ -146,6 +151,9 @@ def _lines(figures: Mapping[str, Any]) -> list[str]:
         f"{figures['size_median_uT']:.1f} uT (80 % within {low:.1f} to {high:.1f}), "
         f"dip {math.degrees(figures['dip_rad']):.0f} deg"
     ]
+    if figures["covered_s"] < _COVERED * figures["recording_s"]:
+        known, whole = figures["covered_s"], figures["recording_s"]
+        lines.append(f"magnetometer: samples in {known:.0f} of {whole:.0f} s only")
     agreement, lag = figures["correlation_with_gyroscope"], figures["lag_s"]
     if agreement is not None:
         first, last = (1e3 * limit for limit in (_LAGS_S[0], _LAGS_S[-1]))

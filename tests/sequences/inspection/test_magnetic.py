@@ -63,6 +63,15 @@ def test_a_short_recording_gives_no_verdict_and_its_span_is_named():
         assert "within a minute" not in line
 
 
+def test_a_field_that_ends_halfway_is_said_to():
+    sequence = walk(MagneticField())
+    field = sequence.magnetometer
+    half = field.time < sequence.time[0] + 30.0
+    part = replace(sequence, magnetometer=Magnetometer(field.time[half], field.field[half]))
+    assert any("in 30 of 60 s" in line for line in assess_magnetometer(part).lines)
+    assert not any("of 60 s" in line for line in assess_magnetometer(sequence).lines)
+
+
 @pytest.mark.parametrize("lag", [-0.08, 0.2])
 def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag):
     inspected = inspect_recording(walk(MagneticField(hard_iron=IRON, lag=lag)))
