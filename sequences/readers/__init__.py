@@ -303,7 +303,7 @@ def is_list(path: Path) -> bool:
 
     A line with a single number may be a name, as in TLIO's lists.
     """
-    if path.suffix.lower() not in _LIST_SUFFIXES or first_line(path, comments=True) is None:
+    if path.suffix.lower() not in _LIST_SUFFIXES or not first_line(path, comments=True):
         return False
     lines = first_lines(path, _HEAD_LINES)
     return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))

@@ -103,9 +103,9 @@ def may_be_read(path: Path) -> bool:
     return os.access(path, os.R_OK | (os.X_OK if path.is_dir() else 0))
 
 
-def first_line(path: Path, comments: bool = False) -> str | None:
-    """Return the first line as in `first_lines`, None if there is none."""
-    return next(iter(first_lines(path, 1, comments)), None)
+def first_line(path: Path, comments: bool = False) -> str:
+    """Return the first line as in `first_lines`, empty if there is none."""
+    return next(iter(first_lines(path, 1, comments)), "")
 
 
 def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
@@ -140,11 +140,6 @@ def first_bytes(path: Path, count: int = 16) -> bytes:
             return file.read(count)
     except OSError:
         return b""
-
-
-def first_numbers(path: Path) -> list[float]:
-    """Return the first row's numbers, or an empty list if the first row is anything else."""
-    return numbers_in(first_line(path) or "")
 
 
 def numbers_in(line: str, delimiter: str | None = ",") -> list[float]:

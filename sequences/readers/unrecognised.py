@@ -113,6 +113,6 @@ def _file(path: Path) -> tuple[str, str]:
         return "a pickle, which may run code", "save it as CSV or npy of plain numbers"
     if is_echo(first_lines(path, 1)):
         return "text of `rostopic echo`", "name the bag, or write it with `rostopic echo -p`"
-    if line is None:
+    if not line:
         return "no line of text", "is it empty or compressed?"
     return f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"

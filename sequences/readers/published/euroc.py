@@ -50,7 +50,7 @@ def read_euroc(path: Path) -> ImuSequence:
 
 def _check_titles(imu: Path) -> None:
     """Check that a header which names the IMU's columns has them in EuRoC's order."""
-    header = _header(imu)
+    header = first_line(imu, comments=True)
     names = canonical_names(header)
     if set(names) >= {"t", *IMU} and names[:7] != ["t", *IMU]:
         expected = "time, gyroscope xyz and accelerometer xyz first"
@@ -58,13 +58,9 @@ def _check_titles(imu: Path) -> None:
         raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
 
 
-def _header(path: Path) -> str:
-    return first_line(path, comments=True) or ""
-
-
 def _unit_ns(path: Path) -> int:
     """Return the unit of a file's times [ns], nanoseconds unless its title names another."""
-    return TIME_UNITS.get(time_unit_of(_header(path).split(",")[0]), 1)
+    return TIME_UNITS.get(time_unit_of(first_line(path, comments=True).split(",")[0]), 1)
 
 
 def is_euroc(path: Path) -> bool:
@@ -88,7 +84,7 @@ def _name(imu: Path) -> str:
 def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     # Some copies of EuRoC's files lack the velocity; TUM-VI's never have it.
     estimated = path.parent.name.startswith("state_groundtruth")
-    columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
+    columns = 11 if estimated and first_line(path).count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
     table, time = rows.values, seconds(rows.stamps_ns(_unit_ns(path)), start_ns)
     keep = pose_mask(path, time)

@@ -68,7 +68,7 @@ def read_ridi(path: Path) -> ImuSequence:
         gyro=fields["gyro"],
         accel=fields["acce"],
         truth=trajectory(file, time, fields["pos"], attitude_WB),
-        magnetometer=magnetometer(time, fields.optional(MAGNETIC)),
+        magnetometer=magnetometer(time, fields.get(MAGNETIC)),
     )
 
 
@@ -137,7 +137,7 @@ def _samples(path: Path, width: int) -> Samples:
 
 def _field(path: Path) -> Samples | None:
     """Return the magnetometer's samples, also those that are not finite: it is optional."""
-    if not path.is_file() or first_line(path) is None:
+    if not path.is_file() or not first_line(path):
         return None
     table = read_table(path, 4, RowFormat(delimiter=None))
     return Samples(table.stamps_ns(), table.values[:, 1:])

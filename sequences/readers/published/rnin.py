@@ -43,7 +43,7 @@ def read_rnin(path: Path) -> ImuSequence:
         gyro=fields["gyro"] - fields["vio_gyro_bias"][-1],
         accel=fields["acce"] - fields["vio_acce_bias"][-1],
         truth=trajectory(file, time, fields[f"{source}_p"], fields.rotations(f"{source}_q")),
-        magnetometer=magnetometer(time, fields.optional(MAGNETIC)),
+        magnetometer=magnetometer(time, fields.get(MAGNETIC)),
     )
 
 

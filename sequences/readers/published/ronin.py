@@ -56,7 +56,7 @@ def read_ronin(path: Path) -> ImuSequence:
     if not isinstance(frame, int) or not 0 <= frame <= last:
         raise ReadError(info.path, "start_frame", repr(frame), f"a row from 0 to {last}")
     used = slice(int(np.searchsorted(fields.rows, frame)), None)
-    time, field = fields[_TIME][used], fields.optional(_MAGNETIC)
+    time, field = fields[_TIME][used], fields.get(_MAGNETIC)
     time = time - time[0]
     return ImuSequence(
         name=file.resolve().parent.name,
