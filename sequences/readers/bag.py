@@ -12,7 +12,6 @@ be those of the IMU in a world with z up; `stario inspect` reports if they are n
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -26,10 +25,8 @@ from stario.sequences.readers import checked
 from stario.sequences.readers.clocks import Samples, resample_to_gyro
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.text import first_bytes, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.units import MAGNETIC_UNITS
-
-_log = logging.getLogger(__name__)
 
 _IMU = "sensor_msgs/msg/Imu"
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
@@ -81,18 +78,21 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         stamps, rate, force = resample_to_gyro(path, gyro, accel)
     start_ns, parts = stamps[0], dict[str, Any]()
     for kind, others in messages.items():
-        time, values = others.seconds(start_ns), others.values
+        time, values, topic = others.seconds(start_ns), others.values, others.topic
         if kind == _MAGNETIC:
             parts["magnetometer"] = checked.magnetometer(time, values[:, :3] * MAGNETIC_UNITS["T"])
         elif kind == _PRESSURE:
-            parts["barometer"] = checked.barometer(path, others.topic, time, values[:, 0], "Pa")
+            parts["barometer"] = checked.barometer(path, topic, time, values[:, 0], "Pa")
         elif kind == _SATELLITES:
             variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
             radius = checked.RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
             rest = {"altitude_m": values[:, 2], "radius_m": radius}
             parts["satellites"] = checked.satellites(time, values[:, :2], rest)
         else:
-            parts["truth"] = _truth(path, others, time)
+            rows = checked.finite_rows(path, topic, values[:, :7])
+            field, quat = f"{topic}, quaternion", values[rows, 3:7]
+            attitude_WB = checked.rotations(path, field, quat, "xyzw", rows)
+            parts["truth"] = checked.trajectory(path, time[rows], values[rows, :3], attitude_WB)
     own = agreeing_attitude(imu.stamps_ns, imu.values[:, _ORIENTATION], gyro)
     attitude, time = device_attitude(own, start_ns), seconds(stamps, start_ns)
     return ImuSequence(path.resolve().stem, time, rate, force, device_attitude=attitude, **parts)
@@ -211,10 +211,3 @@ def _decoded(
         order = np.argsort(stamps, kind="stable")
         stamps, values = stamps[order], values[order]
     return _Messages(stamps, values, topic=topic)
-
-
-def _truth(path: Path, poses: _Messages, time: FloatArray) -> Trajectory:
-    rows = checked.finite_rows(path, poses.topic, poses.values[:, :7])
-    quat = poses.values[rows, 3:7]
-    attitude_WB = checked.rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", rows)
-    return checked.trajectory(path, time[rows], poses.values[rows, :3], attitude_WB)

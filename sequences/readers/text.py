@@ -67,7 +67,12 @@ def read_lines(path: Path) -> list[str]:
         found = (error.strerror or "an error").lower()
         raise ReadError(path, "file", found, "a readable file") from None
     if not content.startswith(_UTF_16):
-        content = _without_padding(path, content)
+        size, content = len(content), content.rstrip(b"\0")
+        if b"\0" in content:
+            raise ReadError(path, "file", "binary data", "UTF-8 text")
+        if count := size - len(content):
+            words = "%s: skipped %d zero bytes at the end: did the recorder lose power?"
+            _log.warning(words, path, count)
     lines = _decoded(content).splitlines()
     if not any(line.strip() for line in lines):
         raise ReadError(path, "file", "no lines", "rows of numbers", "is the download complete?")
@@ -83,19 +88,6 @@ def read_json(path: Path) -> Any:
     except (OSError, ValueError, RecursionError) as error:
         found = " ".join(str(error).split())
         raise ReadError(path, "file", found, "JSON", "is the download complete?") from None
-
-
-def _without_padding(path: Path, content: bytes) -> bytes:
-    """Return a file's text without the zeros that a recorder which lost power left at its end."""
-    text = content.rstrip(b"\0")
-    if b"\0" in text:
-        raise ReadError(path, "file", "binary data", "UTF-8 text")
-    if len(text) < len(content):
-        count = len(content) - len(text)
-        _log.warning(
-            "%s: skipped %d zero bytes at the end: did the recorder lose power?", path, count
-        )
-    return text
 
 
 def may_be_read(path: Path) -> bool:
@@ -182,7 +174,7 @@ def unquoted(line: str, delimiter: str | None, decimal: str = ".") -> str:
     """
     if '"' in line and delimiter is None:
         line = line.replace('"', " ")
-    elif '"' in line and delimiter is not None:
+    elif '"' in line and delimiter:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
         inner = "." if delimiter == decimal else " "
         line = delimiter.join(cell.replace(delimiter, inner) for cell in cells)
@@ -407,9 +399,8 @@ def read_table(
         except ReadError:
             cut = True
         if cut:
-            _log.warning(
-                "%s: skipped the last row, line %d, which is cut short", path, rows.pop()[0]
-            )
+            words = "%s: skipped the last row, line %d, which is cut short"
+            _log.warning(words, path, rows.pop()[0])
     try:  # several times as fast, but it neither knows blank cells nor explains what is wrong
         lines = [line for _, line in rows]
         used = [place.index for place in places]
