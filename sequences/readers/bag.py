@@ -13,8 +13,8 @@ be those of the IMU in a world with z up; `stario inspect` reports if they are n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
+from posixpath import commonpath
 from typing import Any
 
 import numpy as np
@@ -122,9 +122,8 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
     try:
         with reader_type(path) as reader:
             topics = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
-            pair = [] if imu_topic else _sensor_topics(topics)
-            chosen = pair or [_imu_topic(path, topics, imu_topic)]
-            chosen += _truth_topic(path, topics, truth_topic)
+            imus = _imu_topics(path, topics, imu_topic)
+            chosen = imus + _truth_topic(path, topics, truth_topic)
             for kind in _OTHERS:
                 chosen += _nearest_topic(topics, kind, chosen[0])
             connections = [c for c in reader.connections if c.topic in chosen]
@@ -133,7 +132,7 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
                 received[connection.topic].append((time, bytes(raw)))
         little_endian = version == "1"
         decoded = [_decoded(path, t, topics[t], received[t], little_endian) for t in chosen]
-        kinds = [_APART if pair[1:] == [topic] else topics[topic] for topic in chosen]
+        kinds = [_APART if topic in imus[1:] else topics[topic] for topic in chosen]
         return dict(zip(kinds, decoded, strict=True))
     except ReadError:
         raise
@@ -142,22 +141,20 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
         raise ReadError(path, "file", found, "an intact bag", _MEND) from None
 
 
-def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
-    imus = [topic for topic, kind in sorted(topics.items()) if kind == _IMU]
-    candidates = _named(path, "imu topic", wanted, imus)
+def _imu_topics(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
+    """Return the IMU's topic, or those of gyroscope and accelerometer if there is one of each."""
+    imus = [topic for topic, kind in topics.items() if kind == _IMU]
+    if len(imus) == 2 and not wanted:
+        pair = [next((t for t in imus if word in t.lower()), "") for word in ("gyro", "accel")]
+        if set(pair) == set(imus):
+            return pair
+    candidates = _named(path, "imu topic", wanted, sorted(imus))
     if len(candidates) != 1:
         others = [f"{t} ({k.split('/')[-1]})" for t, k in topics.items()][:8]
         found = ", ".join(candidates or others)
         fix = f"name one: --imu-topic {candidates[0]}" if candidates else ""
         raise ReadError(path, "topics", found or "none", "one topic with sensor_msgs/Imu", fix)
-    return candidates[0]
-
-
-def _sensor_topics(topics: dict[str, str]) -> list[str]:
-    """Return the topics of gyroscope and accelerometer if the only two IMUs are one of each."""
-    candidates = [topic for topic, kind in topics.items() if kind == _IMU]
-    pair = [next((t for t in candidates if word in t.lower()), "") for word in ("gyro", "accel")]
-    return pair if len(candidates) == 2 and all(pair) and pair[0] != pair[1] else []
+    return candidates
 
 
 def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
@@ -175,8 +172,7 @@ def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
 def _nearest_topic(topics: dict[str, str], wanted: str, imu_topic: str) -> list[str]:
     """Return the topic of a kind of sensor; of several, the one nearest to the IMU's by name."""
     candidates = [topic for topic, kind in sorted(topics.items()) if kind == wanted]
-    prefixes = set(accumulate(imu_topic.split("/"), "{}/{}".format))
-    shared = [len(prefixes & set(accumulate(t.split("/"), "{}/{}".format))) for t in candidates]
+    shared = [len(commonpath([f"/{imu_topic}", f"/{topic}"])) for topic in candidates]
     return [candidates[shared.index(max(shared))]] if candidates else []
 
 

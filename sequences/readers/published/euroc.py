@@ -34,28 +34,24 @@ def read_euroc(path: Path) -> ImuSequence:
     if imu is None:
         expected = "an EuRoC or TUM-VI folder with its IMU"
         raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
-    _check_titles(imu)
-    table = read_table(imu, columns=7)
-    stamps = table.stamps_ns(_unit_ns(imu))
-    truth_files = (imu.parent.parent / folder / "data.csv" for folder in TRUTH_FOLDERS)
-    truth_file = next((file for file in truth_files if file.is_file()), None)
-    return ImuSequence(
-        name=_name(imu),
-        time=seconds(stamps, stamps[0]),
-        gyro=table.values[:, 1:4],
-        accel=table.values[:, 4:7],
-        truth=None if truth_file is None else _truth(truth_file, stamps[0]),
-    )
-
-
-def _check_titles(imu: Path) -> None:
-    """Check that a header which names the IMU's columns has them in EuRoC's order."""
     header = first_line(imu, comments=True)
     names = canonical_names(header)
     if set(names) >= {"t", *IMU} and names[:7] != ["t", *IMU]:
         expected = "time, gyroscope xyz and accelerometer xyz first"
         fix = f"read {imu.name} itself with `--format csv`, by its titles"
         raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
+    table = read_table(imu, columns=7)
+    stamps = table.stamps_ns(_unit_ns(imu))
+    truth_files = (imu.parent.parent / folder / "data.csv" for folder in TRUTH_FOLDERS)
+    truth_file = next((file for file in truth_files if file.is_file()), None)
+    folder = imu.resolve().parent.parent
+    return ImuSequence(
+        name=folder.parent.name if folder.name == "mav0" else folder.name,
+        time=seconds(stamps, stamps[0]),
+        gyro=table.values[:, 1:4],
+        accel=table.values[:, 4:7],
+        truth=None if truth_file is None else _truth(truth_file, stamps[0]),
+    )
 
 
 def _unit_ns(path: Path) -> int:
@@ -74,11 +70,6 @@ def imu_file(path: Path) -> Path | None:
         return path if path.name == "data.csv" and path.parent.name.startswith("imu") else None
     candidates = (path / "mav0/imu0/data.csv", path / "imu0/data.csv", path / "data.csv")
     return next((c for c in candidates if c.is_file() and c.parent.name.startswith("imu")), None)
-
-
-def _name(imu: Path) -> str:
-    folder = imu.resolve().parent.parent
-    return folder.parent.name if folder.name == "mav0" else folder.name
 
 
 def _truth(path: Path, start_ns: np.int64) -> Trajectory:

@@ -62,8 +62,9 @@ def read_ridi(path: Path) -> ImuSequence:
     attitude_WB = pose[0] * game_rv[0].inv() * game_rv
     if _y_is_up(file, attitude_WB, fields["acce"]):
         attitude_WB = _UPRIGHT * attitude_WB
+    folder = file.resolve().parent
     return ImuSequence(
-        name=_name(file),
+        name=folder.parent.name if folder.name == "processed" else folder.name,
         time=time,
         gyro=fields["gyro"],
         accel=fields["acce"],
@@ -99,11 +100,6 @@ def _y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
         tilt = np.degrees(np.arccos(np.clip(cosines[2], -1.0, 1.0)))
         _log.warning("%s: with its poses, specific force is %.0f degrees off vertical", path, tilt)
     return bool(cosines[1] > cosines[2])
-
-
-def _name(file: Path) -> str:
-    folder = file.resolve().parent
-    return folder.parent.name if folder.name == "processed" else folder.name
 
 
 def read_imunet(path: Path) -> ImuSequence:
