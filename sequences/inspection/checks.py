@@ -150,18 +150,16 @@ def downward(accel: FloatArray) -> list[Finding]:
 
 def _advice(sequence: ImuSequence, sensor: str, unit: str) -> str:
     """Return how to convert a sensor that is in another unit, by where its numbers come from."""
+    fix = {
+        "deg/s": "give np.radians(gyro)",
+        "g": f"give {STANDARD_GRAVITY} * accel",
+        "mg": f"give {STANDARD_GRAVITY / 1e3} * accel",
+        "mdps": "give np.radians(gyro / 1000)",
+    }[unit]
     if sequence.source:
         title = f"write `{sensor[0]}x [{unit}]` in the CSV's header"
-        return f"if it is in {unit}, pass `--{sensor}-unit {unit}` or {title}"
-    return (
-        f"if it is in {unit}, "
-        + {
-            "deg/s": "give np.radians(gyro)",
-            "g": f"give {STANDARD_GRAVITY} * accel",
-            "mg": f"give {STANDARD_GRAVITY / 1e3} * accel",
-            "mdps": "give np.radians(gyro / 1000)",
-        }[unit]
-    )
+        fix = f"pass `--{sensor}-unit {unit}` or {title}"
+    return f"if it is in {unit}, {fix}"
 
 
 def _check_content(sequence: ImuSequence) -> None:
@@ -207,26 +205,22 @@ def check_gyro(
         found += " that contradict the accelerometer"
     elif speed <= FAST_RAD_S:
         undecided = abs(force - in_degrees - lost) < _UNDECIDED * force
-        if speed > _SUSTAINED_RAD_S and undecided and fix != _UNIT_NAMED and _upright(gyro, accel):
-            text = (
-                f"gyroscope: found rotations of {speed:.3g} rad/s, all about the vertical, of "
-                "which the accelerometer tells nothing"
-            )
-            values = {"rate_rad_s": speed}
-            return force, average, [Finding("gyro_unit_open", text, fix, values=values)]
-        return force, average, []
+        if not (speed > _SUSTAINED_RAD_S and undecided and fix != _UNIT_NAMED):
+            return force, average, []
+        up = accel / np.linalg.norm(accel, axis=1, keepdims=True)
+        if np.sum(np.sum(gyro * up, axis=1) ** 2) <= _ABOUT_UP * np.sum(gyro**2):
+            return force, average, []
+        text = (
+            f"gyroscope: found rotations of {speed:.3g} rad/s, all about the vertical, of which "
+            "the accelerometer tells nothing"
+        )
+        finding = Finding("gyro_unit_open", text, fix, values={"rate_rad_s": speed})
+        return force, average, [finding]
     if speed <= FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
     elif fix != _UNIT_NAMED and speed * GYRO_UNITS["deg/s"] > FAST_RAD_S:
         fix = "these are neither rad/s nor deg/s: convert a sensor's counts to one of the two"
     raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
-
-
-def _upright(gyro: FloatArray, accel: FloatArray) -> bool:
-    """Return whether a device turns about the vertical, as which the force (N, 3) counts."""
-    up = accel / np.linalg.norm(accel, axis=1, keepdims=True)
-    about_up = np.sum(np.sum(gyro * up, axis=1) ** 2)
-    return bool(about_up > _ABOUT_UP * np.sum(gyro**2))
 
 
 def _check_swapped(

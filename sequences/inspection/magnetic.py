@@ -105,7 +105,10 @@ def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
         agreement, lag, iron, sigma = _against_gyro(time, gyro, stamps, values)
     following = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
     R_NB = levelled_attitudes(time, gyro, accel)[following]
-    certain = _certain_iron(iron, sigma)
+    certain = None  # hard iron that must be removed before the field is assessed
+    if iron is not None and sigma is not None:
+        sure = np.abs(iron) > _SURE * sigma
+        certain = iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
     field_N = np.einsum("nij,nj->ni", R_NB, values if certain is None else values - certain)
     level = np.hypot(field_N[:, 0], field_N[:, 1])
     spread, drift = _steadiness(stamps, field_N[:, :2])
@@ -200,14 +203,6 @@ def _findings(figures: Mapping[str, Any], iron: FloatArray | None) -> list[Findi
         fix = "elsewhere, the accelerometer has Apple's sign: pass `--accel-sign apple`"
         result.append(Finding("field_up", text, fix, values={"up_deg": up}))
     return result
-
-
-def _certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArray | None:
-    """Return the hard iron if it must be removed before the field is assessed."""
-    if iron is None or sigma is None:
-        return None
-    sure = np.abs(iron) > _SURE * sigma
-    return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
 
 
 def _against_gyro(

@@ -78,7 +78,15 @@ def sample_findings(sequence: ImuSequence) -> list[Finding]:
         found.append(Finding("values_impossible", text, values={"samples": invalid}))
     given = usable(sequence) & np.isfinite(sequence.time)
     samples = sequence.time[given], sequence.gyro[given], sequence.accel[given]
-    return found + stuck_findings(*samples) + _at_limit(sequence)
+    found += stuck_findings(*samples)
+    fix = "choose a larger range of the sensor, if the logger offers one"
+    for sensor, of_all, unit, large in (
+        ("gyroscope", sequence.gyro, "rad/s", _LARGE_RAD_S),
+        ("accelerometer", sequence.accel, "m/s^2", LARGE_M_S2),
+    ):  # as streams do (`fusion.imu.faults`)
+        if words := limit_words(sensor, of_all[usable(sequence)], unit, large):
+            found.append(Finding(f"{sensor}_limit", words, fix))
+    return found
 
 
 def _late(sequence: ImuSequence) -> list[Finding]:
@@ -101,20 +109,6 @@ def _late(sequence: ImuSequence) -> list[Finding]:
         )
     values = {"by_s": by, "at_s": at, "longest_s": seconds}
     return [Finding(code, text, "split the recording there", values=values)]
-
-
-def _at_limit(sequence: ImuSequence) -> list[Finding]:
-    """Report a sensor at its limit, as streams do (`fusion.imu.faults`)."""
-    given = usable(sequence)
-    advice = "choose a larger range of the sensor, if the logger offers one"
-    return [
-        Finding(f"{sensor}_limit", words, advice)
-        for sensor, values, unit, large in (
-            ("gyroscope", sequence.gyro[given], "rad/s", _LARGE_RAD_S),
-            ("accelerometer", sequence.accel[given], "m/s^2", LARGE_M_S2),
-        )
-        if (words := limit_words(sensor, values, unit, large))
-    ]
 
 
 def limit_words(sensor: str, values: FloatArray, unit: str, large: float) -> str:

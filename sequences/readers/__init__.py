@@ -71,7 +71,7 @@ def _unpacked(unpack: Callable[..., None], source: str = "") -> Callable[..., Im
         with tempfile.TemporaryDirectory(prefix="stario-") as temporary:
             folder = Path(temporary)
             unpack(path, folder, **options)
-            inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
+            inside = [folder] if _recognised(folder) else sorted(_below(folder)) or [folder]
             if len(inside) > 1:
                 names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
                 found = f"{len(inside)} recordings ({names})"
@@ -112,14 +112,11 @@ FORMATS: dict[str, Format] = {
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings. Files are found below a folder by `_SUFFIXES`."""
 
-_KNOWN = "a recording in a known format (`stario inspect --help` lists them)"
-
 _SUFFIXES = (
     *(".csv", ".txt", ".tsv", ".log", ".json", ".zip"),
     *(".bag", ".mcap", ".db3", ".hdf5", ".h5"),
 )
 """Suffixes of files that may be a recording by themselves."""
-
 
 _LIST_SUFFIXES = (".txt", ".list", ".lst")
 _HEAD_LINES = 20
@@ -146,7 +143,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     if "rate" in options and format == "auto":  # by which even an unknown table is read
         name = "untimed"
     if name is None:
-        raise unrecognised(path, sorted(_below(path)), _KNOWN)
+        raise unrecognised(path, sorted(_below(path)))
     for option in options:
         if option not in FORMATS[name].options:
             known = ", ".join(FORMATS[name].options) or "none"
@@ -186,13 +183,13 @@ def find_recordings(
         if members := archive_members(path, where):
             return members
         raise ReadError(path, "imu/t", "none in the whole archive", "recordings with IMU samples")
-    if _is_recording(path):
+    if _recognised(path):
         return _with_attributes([path], where)
     if is_list(path):
         return _listed(path, on_error, where)
     found = [path] if path.is_file() else sorted(_below(path))
     if not found:
-        raise unrecognised(path, [], _KNOWN)
+        raise unrecognised(path, [])
     return _with_attributes(found, where)
 
 
@@ -234,18 +231,16 @@ def _below(path: Path) -> list[Path]:
     found: list[Path] = []
     for folder, subfolders, files in os.walk(path):
         here = Path(folder)
-        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
-        recordings = [name for name in subfolders if _is_recording(here / name)]
+        visible = [name for name in subfolders if not name.startswith(".")]
+        recordings = [name for name in visible if _recognised(here / name)]
         found += [here / name for name in recordings]
-        duplicates = {"raw"} if "syn" in subfolders else set()
-        subfolders[:] = [name for name in subfolders if name not in {*recordings, *duplicates}]
-        for name in files:
-            if not name.lower().endswith(_SUFFIXES):
-                continue
-            if is_archive(here / name):
-                found += archive_members(here / name)
-            elif _is_recording(here / name):
-                found.append(here / name)
+        left_out = {*recordings, *(["raw"] if "syn" in visible else [])}
+        subfolders[:] = [name for name in visible if name not in left_out]
+        for file in (here / name for name in files if name.lower().endswith(_SUFFIXES)):
+            if is_archive(file):
+                found += archive_members(file)
+            elif _recognised(file):
+                found.append(file)
     return found
 
 
@@ -293,7 +288,7 @@ def _entry(path: Path, number: int, name: str, located: Path | None) -> Path:
     if located is None:
         found, fix = f"{name!r}, which does not exist", "remove the line or fetch the recording"
         raise ReadError(path, line, found, "the name of a recording", fix)
-    if not _is_recording(located) and is_list(located):
+    if not _recognised(located) and is_list(located):
         raise ReadError(path, "list", f"another list, {located.name}", "recordings")
     return located
 
@@ -303,7 +298,7 @@ def is_list(path: Path) -> bool:
 
     A line with a single number may be a name, as in TLIO's lists.
     """
-    if path.suffix.lower() not in _LIST_SUFFIXES or first_line(path, comments=True) is None:
+    if path.suffix.lower() not in _LIST_SUFFIXES or not first_line(path, comments=True):
         return False
     lines = first_lines(path, _HEAD_LINES)
     return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
@@ -329,10 +324,6 @@ def _located(bases: list[Path], name: str) -> Path | None:
     forms = [path, *(path.parent / form / path.name for form in _OXIOD_FORMS)]
     candidates = (base / form for base in bases for form in forms)
     return next((found for found in candidates if split_name(found)[0].exists()), None)
-
-
-def _is_recording(path: Path) -> bool:
-    return _recognised(path) is not None
 
 
 def _recognised(path: Path) -> str | None:

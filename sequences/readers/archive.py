@@ -26,7 +26,6 @@ from stario.sequences.arrays import (
     finite_times,
     shortlist,
 )
-from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError, ReadError, StarioError
 from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
@@ -179,12 +178,8 @@ def _matches(attributes: Mapping[str, str | float], where: AttributeFilter) -> b
 def _none_chosen(
     path: Path, known: list[dict[str, str | float]], where: AttributeFilter
 ) -> ReadError:
-    none_match = (
-        key
-        for key, patterns in where.items()
-        if not any(_matches(attributes, {key: patterns}) for attributes in known)
-    )
-    key = next(none_match, next(iter(where)))
+    matched = {key for key in where for one in known if _matches(one, {key: where[key]})}
+    key = next((key for key in where if key not in matched), next(iter(where)))
     values = sorted({_text(attributes.get(key, "")) for attributes in known} - {""})
     listed = shortlist(values, 6)
     expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
@@ -337,6 +332,7 @@ def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[st
 
 
 def _write(group: Any, sequence: ImuSequence) -> None:
+    """Write a recording; flags are left out if all are True, which readers take for granted."""
     track, layouts = sequence.positions, dict(PARTS)
     if track is not None and track.kind == "positions" and sequence.truth is not None:
         _log.warning("%s: positions alongside true poses are not written", sequence.name)
@@ -345,23 +341,13 @@ def _write(group: Any, sequence: ImuSequence) -> None:
         layouts["positions"] = track_layout(track.kind, "xy" if flat else "p")
     columns = {"imu/t": sequence.time, "imu/gyro": sequence.gyro, "imu/accel": sequence.accel}
     for attribute, layout in layouts.items():
-        if (part := getattr(sequence, attribute)) is not None:
-            columns |= _columns(layout, part)
+        part = getattr(sequence, attribute)
+        for name, field in ({"t": "time"} | layout.needed | layout.optional).items():
+            value = None if part is None else getattr(part, field)
+            if value is not None and not (field == "valid" and value.all()):
+                value = value.as_quat() if field == "attitude_WB" else value
+                columns[f"{layout.stem}/{name}"] = value
     for name, values in columns.items():
         group.create_dataset(name, data=values, **(_COMPRESSION if len(values) else {}))
     for key, value in sequence.attributes.items():
         group.attrs[key] = value
-
-
-def _columns(layout: Layout, part: Timed) -> dict[str, FloatArray]:
-    """Return the known attributes of a part by their datasets' names.
-
-    Flags are left out if all are True, which is what a reader takes for granted.
-    """
-    columns = {}
-    for name, attribute in ({"t": "time"} | layout.needed | layout.optional).items():
-        value = getattr(part, attribute)
-        if value is not None and not (attribute == "valid" and value.all()):
-            value = value.as_quat() if attribute == "attitude_WB" else value
-            columns[f"{layout.stem}/{name}"] = value
-    return columns

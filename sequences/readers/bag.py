@@ -12,10 +12,9 @@ be those of the IMU in a world with z up; `stario inspect` reports if they are n
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
+from posixpath import commonpath
 from typing import Any
 
 import numpy as np
@@ -26,10 +25,8 @@ from stario.sequences.readers import checked
 from stario.sequences.readers.clocks import Samples, resample_to_gyro
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.text import first_bytes, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.units import MAGNETIC_UNITS
-
-_log = logging.getLogger(__name__)
 
 _IMU = "sensor_msgs/msg/Imu"
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
@@ -81,18 +78,21 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         stamps, rate, force = resample_to_gyro(path, gyro, accel)
     start_ns, parts = stamps[0], dict[str, Any]()
     for kind, others in messages.items():
-        time, values = others.seconds(start_ns), others.values
+        time, values, topic = others.seconds(start_ns), others.values, others.topic
         if kind == _MAGNETIC:
             parts["magnetometer"] = checked.magnetometer(time, values[:, :3] * MAGNETIC_UNITS["T"])
         elif kind == _PRESSURE:
-            parts["barometer"] = checked.barometer(path, others.topic, time, values[:, 0], "Pa")
+            parts["barometer"] = checked.barometer(path, topic, time, values[:, 0], "Pa")
         elif kind == _SATELLITES:
             variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
             radius = checked.RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
             rest = {"altitude_m": values[:, 2], "radius_m": radius}
             parts["satellites"] = checked.satellites(time, values[:, :2], rest)
         else:
-            parts["truth"] = _truth(path, others, time)
+            rows = checked.finite_rows(path, topic, values[:, :7])
+            field, quat = f"{topic}, quaternion", values[rows, 3:7]
+            attitude_WB = checked.rotations(path, field, quat, "xyzw", rows)
+            parts["truth"] = checked.trajectory(path, time[rows], values[rows, :3], attitude_WB)
     own = agreeing_attitude(imu.stamps_ns, imu.values[:, _ORIENTATION], gyro)
     attitude, time = device_attitude(own, start_ns), seconds(stamps, start_ns)
     return ImuSequence(path.resolve().stem, time, rate, force, device_attitude=attitude, **parts)
@@ -122,9 +122,8 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
     try:
         with reader_type(path) as reader:
             topics = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
-            pair = [] if imu_topic else _sensor_topics(topics)
-            chosen = pair or [_imu_topic(path, topics, imu_topic)]
-            chosen += _truth_topic(path, topics, truth_topic)
+            imus = _imu_topics(path, topics, imu_topic)
+            chosen = imus + _truth_topic(path, topics, truth_topic)
             for kind in _OTHERS:
                 chosen += _nearest_topic(topics, kind, chosen[0])
             connections = [c for c in reader.connections if c.topic in chosen]
@@ -133,7 +132,7 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
                 received[connection.topic].append((time, bytes(raw)))
         little_endian = version == "1"
         decoded = [_decoded(path, t, topics[t], received[t], little_endian) for t in chosen]
-        kinds = [_APART if pair[1:] == [topic] else topics[topic] for topic in chosen]
+        kinds = [_APART if topic in imus[1:] else topics[topic] for topic in chosen]
         return dict(zip(kinds, decoded, strict=True))
     except ReadError:
         raise
@@ -142,22 +141,20 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
         raise ReadError(path, "file", found, "an intact bag", _MEND) from None
 
 
-def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
-    imus = [topic for topic, kind in sorted(topics.items()) if kind == _IMU]
-    candidates = _named(path, "imu topic", wanted, imus)
+def _imu_topics(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
+    """Return the IMU's topic, or those of gyroscope and accelerometer if there is one of each."""
+    imus = [topic for topic, kind in topics.items() if kind == _IMU]
+    if len(imus) == 2 and not wanted:
+        pair = [next((t for t in imus if word in t.lower()), "") for word in ("gyro", "accel")]
+        if set(pair) == set(imus):
+            return pair
+    candidates = _named(path, "imu topic", wanted, sorted(imus))
     if len(candidates) != 1:
         others = [f"{t} ({k.split('/')[-1]})" for t, k in topics.items()][:8]
         found = ", ".join(candidates or others)
         fix = f"name one: --imu-topic {candidates[0]}" if candidates else ""
         raise ReadError(path, "topics", found or "none", "one topic with sensor_msgs/Imu", fix)
-    return candidates[0]
-
-
-def _sensor_topics(topics: dict[str, str]) -> list[str]:
-    """Return the topics of gyroscope and accelerometer if the only two IMUs are one of each."""
-    candidates = [topic for topic, kind in topics.items() if kind == _IMU]
-    pair = [next((t for t in candidates if word in t.lower()), "") for word in ("gyro", "accel")]
-    return pair if len(candidates) == 2 and all(pair) and pair[0] != pair[1] else []
+    return candidates
 
 
 def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
@@ -175,8 +172,7 @@ def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
 def _nearest_topic(topics: dict[str, str], wanted: str, imu_topic: str) -> list[str]:
     """Return the topic of a kind of sensor; of several, the one nearest to the IMU's by name."""
     candidates = [topic for topic, kind in sorted(topics.items()) if kind == wanted]
-    prefixes = set(accumulate(imu_topic.split("/"), "{}/{}".format))
-    shared = [len(prefixes & set(accumulate(t.split("/"), "{}/{}".format))) for t in candidates]
+    shared = [len(commonpath([f"/{imu_topic}", f"/{topic}"])) for topic in candidates]
     return [candidates[shared.index(max(shared))]] if candidates else []
 
 
@@ -211,10 +207,3 @@ def _decoded(
         order = np.argsort(stamps, kind="stable")
         stamps, values = stamps[order], values[order]
     return _Messages(stamps, values, topic=topic)
-
-
-def _truth(path: Path, poses: _Messages, time: FloatArray) -> Trajectory:
-    rows = checked.finite_rows(path, poses.topic, poses.values[:, :7])
-    quat = poses.values[rows, 3:7]
-    attitude_WB = checked.rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", rows)
-    return checked.trajectory(path, time[rows], poses.values[rows, :3], attitude_WB)

@@ -55,15 +55,18 @@ UNITS = {
 }
 """Factors of the units of these attributes, without a unit as well."""
 
+_PRESSURE = (
+    f"pressure of {LOWEST_HPA:g} to {HIGHEST_HPA:g} hPa, or in Pa, kPa or inHg",
+    "is it an altitude?",
+)
+"""What is expected of a barometer's values, and what others may be."""
+
 RADIUS_PER_SIGMA = 1.51
 """Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
 
 USUAL_RADIUS, LARGEST_RADIUS = 10.0, 30.0
 """Radius [m] where none is stated, and the largest: more is that of positions from the network's
 cells or of rooms without reception."""
-
-_LARGEST_DEGREES = 90.0, 180.0
-"""Largest latitude and longitude."""
 
 
 def finite_rows(path: Path, field: str, values: FloatArray, all_of_them: bool = False) -> IntArray:
@@ -183,11 +186,11 @@ def _in_hPa(path: Path, title: str, values: FloatArray, unit: str) -> FloatArray
     """Return pressures (N,) in the named unit, or in the one that fits a typical value, in hPa."""
     value = float(np.median(values))
     if unit and unit not in PRESSURE_UNITS:
-        raise ReadError(path, title, f"{value:.6g} {unit}", *_expected())
+        raise ReadError(path, title, f"{value:.6g} {unit}", *_PRESSURE)
     likely = unit
     if not (unit and LOWEST_HPA <= PRESSURE_UNITS[unit] * value <= HIGHEST_HPA):
         if not (likely := pressure_unit_of(value)):
-            raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_expected())
+            raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_PRESSURE)
         if unit:
             words = "%s: %s: %.6g is no pressure in %s: read as %s"
             _log.warning(words, path, title, value, unit, likely)
@@ -196,18 +199,13 @@ def _in_hPa(path: Path, title: str, values: FloatArray, unit: str) -> FloatArray
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     if not unit and step > _LARGEST_STEP_HPA:
         found = f"steps of {step:.2g} hPa, which is {8.4 * step:.0f} m of height"
-        raise ReadError(path, title, found, *_expected())
+        raise ReadError(path, title, found, *_PRESSURE)
     return np.asarray(pressure_hPa)
-
-
-def _expected() -> tuple[str, str]:
-    expected = f"pressure of {LOWEST_HPA:g} to {HIGHEST_HPA:g} hPa, or in Pa, kPa or inHg"
-    return expected, "is it an altitude?"
 
 
 def known_places(latlon_deg: FloatArray) -> BoolArray:
     """Return which latitudes and longitudes (N, 2) are a place, unlike zeros until the first."""
-    return np.asarray((np.abs(latlon_deg) <= _LARGEST_DEGREES).all(axis=1) & latlon_deg.any(axis=1))
+    return np.asarray((np.abs(latlon_deg) <= [90, 180]).all(axis=1) & latlon_deg.any(axis=1))
 
 
 def in_degrees(path: Path, latlon_deg: FloatArray) -> FloatArray:

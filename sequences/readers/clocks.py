@@ -62,13 +62,13 @@ class Samples:
         stamps_ns: (N,) times [ns].
         values: (N, K) values.
         unit: unit named in the file; empty if none.
-        assumed_time_unit: unit that times without one were taken for; empty if it is certain.
+        assumed: ", times taken as" and a unit, if they name none; empty if it is certain.
     """
 
     stamps_ns: IntArray
     values: FloatArray
     unit: str = ""
-    assumed_time_unit: str = ""
+    assumed: str = ""
 
     def seconds(self, origin_ns: np.int64) -> FloatArray:
         """Return the times (N,) [s] since an origin."""
@@ -205,15 +205,10 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     return unit
 
 
-def source_words(source: str, unit: str) -> str:
-    """Return a recording's source with the unit that its times were taken for, if there is one."""
-    return f"{source}, times taken as {unit}" if unit else source
-
-
 def clock_unit(
     file: Path, clock: Column, time: FloatArray, or_seconds: bool = False
 ) -> tuple[int, str]:
-    """Return the unit [ns] of a clock's times (N,), and its name if another is possible.
+    """Return the unit [ns] of a clock's times (N,), and `assumed` of `Samples`.
 
     Without a unit, counts of rows and dates without separators are refused: either would pass for
     times. Those at a rate of no unit are too, or taken as seconds unless that is after 2100.
@@ -230,7 +225,8 @@ def clock_unit(
         return TIME_UNITS["s"], ""
     if first * unit_ns * 1e-9 > _SINCE_1970_S:  # which fits no other unit
         return unit_ns, ""
-    return unit_ns, next(unit for unit, ns in TIME_UNITS.items() if ns == unit_ns)
+    name = next(unit for unit, ns in TIME_UNITS.items() if ns == unit_ns)
+    return unit_ns, f", times taken as {name}"
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:

@@ -200,20 +200,19 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
 
 def _log_ignored(path: Path, ignored: list[str], has_truth: bool) -> None:
     _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
-    if others := [title for title in ignored if _is_of_an_imu(title)]:
+    others = [
+        title
+        for title in ignored
+        if (axis := axis_of(title))
+        and not is_uncalibrated(axis[1])
+        and sensor_of(axis[1]) in ("gyro", "accel")
+    ]
+    if others:
         _log.warning("%s: columns of another IMU are not read: %s", path, ", ".join(others))
     truth_like = ", ".join(title for title in ignored if _LIKE_TRUTH.match(title))
     if truth_like and not has_truth:
         message = "%s: no ground truth is read from %s: it must have %s"
         _log.warning(message, path, truth_like, TRUTH_HEADER)
-
-
-def _is_of_an_imu(title: str) -> bool:
-    """Return whether a title names an axis of a gyroscope or accelerometer, raw variants aside."""
-    axis = axis_of(title)
-    if axis is None or is_uncalibrated(axis[1]):
-        return False
-    return sensor_of(axis[1]) in ("gyro", "accel")
 
 
 def unit_factor(path: Path, column: Column, known: Mapping[str, float]) -> float:

@@ -20,26 +20,10 @@ from typing import Literal
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers import checked, columns
-from stario.sequences.readers.clocks import Samples, clock_unit, resample_to_gyro, source_words
+from stario.sequences.readers import checked, columns, text
+from stario.sequences.readers.clocks import Samples, clock_unit, resample_to_gyro
 from stario.sequences.readers.table_head import refuse_several_devices
-from stario.sequences.readers.text import (
-    Column,
-    IntArray,
-    RowFormat,
-    Table,
-    decimal_mark,
-    ends_within_a_row,
-    is_missing,
-    is_row,
-    read_lines,
-    read_table,
-    seconds,
-    unquoted,
-    with_seconds,
-)
 from stario.sequences.sequence import (
-    Barometer,
     BoolArray,
     FloatArray,
     ImuSequence,
@@ -74,6 +58,10 @@ def read_generic_csv(path: Path) -> ImuSequence:
     rows, time, gyro, accel = _samples(rows, gyro, accel)
     truth, positions = _ground_truth(rows)
     field = rows.vectors("m", MAGNETIC_UNITS)[0] if "mx" in rows.values else None
+    barometer = None
+    if place := rows.columns.get(columns.PRESSURE):
+        values = rows.values[columns.PRESSURE]
+        barometer = checked.barometer(path, place.title, rows.time, values, place.unit)
     converted = {
         "gyro": gyro_factors != 1.0,
         "accel": np.abs(accel_factors) != 1.0,
@@ -87,9 +75,9 @@ def read_generic_csv(path: Path) -> ImuSequence:
         truth=truth,
         positions=positions,
         magnetometer=checked.magnetometer(rows.time, field, held=False),
-        barometer=_barometer(rows),
+        barometer=barometer,
         satellites=_satellites(rows),
-        source=source_words("generic CSV", rows.assumed_unit),
+        source=f"generic CSV{rows.assumed}",
         converted=frozenset(sensor for sensor, done in converted.items() if done.any()),
     )
 
@@ -101,18 +89,15 @@ def is_generic_csv(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Columns (N,) of a file by canonical name, times [s], and the mask of IMU samples.
-
-    `assumed_unit` is the unit that times without one were taken for, empty if it is certain.
-    """
+    """Columns (N,) of a file by canonical name, times [s], IMU samples; `assumed` of `Samples`."""
 
     path: Path
-    columns: Mapping[str, Column]
+    columns: Mapping[str, text.Column]
     values: dict[str, FloatArray]
     time: FloatArray
     is_imu: BoolArray
-    line_numbers: IntArray
-    assumed_unit: str
+    line_numbers: text.IntArray
+    assumed: str
 
     def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
@@ -124,13 +109,13 @@ class _Rows:
 
 
 def _read_rows(path: Path) -> _Rows:
-    lines = read_lines(path)
+    lines = text.read_lines(path)
     header = columns.read_header(path, lines)
     separator, places, clock = header.separator, header.columns, header.columns["t"]
-    decimal = decimal_mark(lines[header.lines :], separator)
+    decimal = text.decimal_mark(lines[header.lines :], separator)
     cells = _first_cells(path, lines, header, decimal)
-    dated = with_seconds(cells[clock.index : clock.index + 1])
-    row_format = RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])
+    dated = text.with_seconds(cells[clock.index : clock.index + 1])
+    row_format = text.RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])
     wanted = {name: places[name] for name in ("t", *columns.QUANTITIES) if name in places}
     table = _table(path, wanted, row_format, lines)
     names = list(wanted)[: len(table.columns)]
@@ -144,20 +129,23 @@ def _read_rows(path: Path) -> _Rows:
         clock = replace(clock, unit="s")
     unit_ns, assumed = clock_unit(path, clock, finite, or_seconds=True)
     time = table.seconds(unit_ns, int(np.argmax(is_imu)))
-    values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
-    return _Rows(path, places, values, time, is_imu, table.line_numbers, assumed)
+    values = dict(zip(names, table.values.T, strict=True))
+    read = {name: places[name] for name in names}
+    return _Rows(path, read, values, time, is_imu, table.line_numbers, assumed)
 
 
-def _table(path: Path, wanted: dict[str, Column], row_format: RowFormat, lines: list[str]) -> Table:
+def _table(
+    path: Path, wanted: dict[str, text.Column], row_format: text.RowFormat, lines: list[str]
+) -> text.Table:
     """Return columns; without the rare ones, the last, where these hold something else."""
-    cut = ends_within_a_row(path, row_format.delimiter)
+    cut = text.ends_within_a_row(path, row_format.delimiter)
     try:
-        return read_table(path, list(wanted.values()), row_format, cut, lines)
+        return text.read_table(path, list(wanted.values()), row_format, cut, lines)
     except ReadError as error:
         common = [place for name, place in wanted.items() if name not in columns.RARE]
         if len(common) == len(wanted):
             raise
-        table = read_table(path, common, row_format, cut, lines)
+        table = text.read_table(path, common, row_format, cut, lines)
         _log.warning("pressure and satellites skipped: %s", error)
         return table
 
@@ -165,8 +153,8 @@ def _table(path: Path, wanted: dict[str, Column], row_format: RowFormat, lines: 
 def _first_cells(path: Path, lines: list[str], header: columns.Header, decimal: str) -> list[str]:
     """Return the cells of the first row, checked to be no more than there are titles."""
     numbered = enumerate(lines[header.lines :], header.lines + 1)
-    number, first = next(((k, line) for k, line in numbered if is_row(line)), (0, ""))
-    cells = unquoted(first, header.separator, decimal).rstrip(f"{header.separator} ")
+    number, first = next(((k, line) for k, line in numbered if text.is_row(line)), (0, ""))
+    cells = text.unquoted(first, header.separator, decimal).rstrip(f"{header.separator} ")
     count = cells.count(header.separator) + 1
     if count > len(header.titles):
         found, expected = f"{count} values", f"{len(header.titles)} as in the header"
@@ -175,7 +163,7 @@ def _first_cells(path: Path, lines: list[str], header: columns.Header, decimal: 
     return cells.split(header.separator)
 
 
-def _warn_of_wide_rows(table: Table, header: columns.Header) -> None:
+def _warn_of_wide_rows(table: text.Table, header: columns.Header) -> None:
     """Say that rows hold more values than there are titles: two lines became one, for example."""
     mark, most = header.separator, len(header.titles) - 1
     wide = [number for number, line in table.rows if line.rstrip(f"{mark} ").count(mark) > most]
@@ -187,12 +175,12 @@ def _warn_of_wide_rows(table: Table, header: columns.Header) -> None:
         )  # fmt: skip
 
 
-def _imu_rows(table: Table, imu: list[int]) -> BoolArray:
+def _imu_rows(table: text.Table, imu: list[int]) -> BoolArray:
     """Return the mask (N,) of IMU samples: rows whose IMU cells are not all blank."""
     is_imu = np.ones(len(table.values), dtype=np.bool_)
     if len(empty := np.flatnonzero(np.isnan(table.values[:, imu]).all(axis=1))):
-        texts = [table.cells(table.columns[k].index) for k in imu]
-        is_imu[empty] = [not all(is_missing(text[k]) for text in texts) for k in empty.tolist()]
+        cells = zip(*(table.cells(table.columns[k].index) for k in imu), strict=True)
+        is_imu[empty] = ~np.array([all(map(text.is_missing, row)) for row in cells])[empty]
     return is_imu
 
 
@@ -207,13 +195,17 @@ def _samples(
     known = rows.is_imu & np.isfinite(rows.time)
     gyro, accel = _without_zeros(rows.path, gyro, accel)
     of_gyro, of_accel = (known & ~np.isnan(values).any(axis=1) for values in (gyro, accel))
-    if of_accel.sum() < 2 or not _in_separate_rows(of_accel[of_gyro]):
+    shared = of_accel[of_gyro]
+    apart = len(shared) > 0 and shared.mean() < _SHARED_ROWS
+    if apart and shared.any():  # a sensor that fails for a while stays NaN, to be counted
+        apart = np.diff(shared).mean() > _ALTERNATING
+    if of_accel.sum() < 2 or not apart:
         return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
     ns = np.rint(np.where(known, rows.time, 0.0) * 1e9).astype(np.int64)
     rates, forces = Samples(ns[of_gyro], gyro[of_gyro]), Samples(ns[of_accel], accel[of_accel])
     stamps, rate, force = resample_to_gyro(rows.path, rates, forces)
     rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
-    return rows, seconds(stamps, stamps[0]), rate, force
+    return rows, text.seconds(stamps, stamps[0]), rate, force
 
 
 def _without_zeros(
@@ -225,23 +217,6 @@ def _without_zeros(
         return gyro, accel
     _log.warning("%s: rows of zeros are those of the other sensor: both are joined by time", path)
     return np.where(no_gyro[:, None], np.nan, gyro), np.where(no_accel[:, None], np.nan, accel)
-
-
-def _in_separate_rows(shared: BoolArray) -> bool:
-    """Return whether rows of the gyroscope (N,), of which some hold the accelerometer, alternate.
-
-    A sensor that fails for a while does not: its samples stay NaN, to be counted.
-    """
-    if not shared.any():
-        return len(shared) > 0
-    return bool(shared.mean() < _SHARED_ROWS and np.diff(shared).mean() > _ALTERNATING)
-
-
-def _barometer(rows: _Rows) -> Barometer | None:
-    if columns.PRESSURE not in rows.values:
-        return None
-    column, values = rows.columns[columns.PRESSURE], rows.values[columns.PRESSURE]
-    return checked.barometer(rows.path, column.title, rows.time, values, column.unit)
 
 
 def _satellites(rows: _Rows) -> Satellites | None:

@@ -165,29 +165,23 @@ def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, poses: _Poses) -> _
     pose_time, attitude = seconds(poses.stamps_ns, start_ns), poses.attitude
     valid = np.ones(len(pose_time), dtype=np.bool_)
     try:
-        aligned = None
-        if pose_time[0] < time[-1] and pose_time[-1] > time[0]:
+        same_clock = bool(pose_time[0] < time[-1] and pose_time[-1] > time[0])
+        if same_clock:
             aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
-        if (
-            aligned is None
-            or aligned.correlation < _MIN_CORRELATION
-            or abs(aligned.lag) > _SAME_CLOCK_S
-        ):
+            agrees = aligned.correlation >= _MIN_CORRELATION
+            same_clock = agrees and abs(aligned.lag) <= _SAME_CLOCK_S
+        if not same_clock:
             pose_time = pose_time + clock_offset(time, gyro, pose_time, attitude, valid)
             aligned = align_tracked_body(time, gyro, accel, pose_time, attitude, valid)
     except InputError:
         return None
     if aligned.correlation < _MIN_CORRELATION:
         return None
-    mount = _squared(max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2])
-    return _Fit(poses, pose_time, aligned, mount)
-
-
-def _squared(mount: Rotation) -> Rotation:
-    """Round a mount to the nearest one by right angles if it is close to that."""
+    mount = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2]
     square = Rotation.create_group("O")
     away = (square.inv() * mount).magnitude()
-    return square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
+    mount = square[int(np.argmin(away))] if away.min() < _SQUARE_RAD else mount
+    return _Fit(poses, pose_time, aligned, mount)
 
 
 def _log_choice(sequence: ImuSequence, fits: list[_Fit], chosen: _Fit) -> None:

@@ -125,7 +125,8 @@ def _titles(above: list[str], delimiter: str | None, width: int) -> list[str]:
     lines = [_titles_at(upto, separator) for upto in nearest for separator in separators]
     found = [titles for titles in lines if len(titles) == width]
     if found:
-        return next(filter(_names_columns, found), found[0])
+        named = (some for some in found if any(is_time(one) or axis_of(one) for one in some))
+        return next(named, found[0])
     return [] if delimiter is None else _titles_at(above, delimiter)  # not the words of a comment
 
 
@@ -133,10 +134,6 @@ def _is_incomplete_row(cells: list[str]) -> bool:
     """Return whether cells are those of a row with few numbers: a sensor has not started yet."""
     present = [cell for cell in cells if not is_missing(cell) and cell.strip().lower() != "nan"]
     return bool(present) and all(math.isfinite(number_of(cell)) for cell in present)
-
-
-def _names_columns(titles: list[str]) -> bool:
-    return any(is_time(title) or axis_of(title) is not None for title in titles)
 
 
 def _titles_at(above: list[str], delimiter: str | None) -> list[str]:

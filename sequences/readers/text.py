@@ -67,7 +67,12 @@ def read_lines(path: Path) -> list[str]:
         found = (error.strerror or "an error").lower()
         raise ReadError(path, "file", found, "a readable file") from None
     if not content.startswith(_UTF_16):
-        content = _without_padding(path, content)
+        size, content = len(content), content.rstrip(b"\0")
+        if b"\0" in content:
+            raise ReadError(path, "file", "binary data", "UTF-8 text")
+        if count := size - len(content):
+            words = "%s: skipped %d zero bytes at the end: did the recorder lose power?"
+            _log.warning(words, path, count)
     lines = _decoded(content).splitlines()
     if not any(line.strip() for line in lines):
         raise ReadError(path, "file", "no lines", "rows of numbers", "is the download complete?")
@@ -85,27 +90,14 @@ def read_json(path: Path) -> Any:
         raise ReadError(path, "file", found, "JSON", "is the download complete?") from None
 
 
-def _without_padding(path: Path, content: bytes) -> bytes:
-    """Return a file's text without the zeros that a recorder which lost power left at its end."""
-    text = content.rstrip(b"\0")
-    if b"\0" in text:
-        raise ReadError(path, "file", "binary data", "UTF-8 text")
-    if len(text) < len(content):
-        count = len(content) - len(text)
-        _log.warning(
-            "%s: skipped %d zero bytes at the end: did the recorder lose power?", path, count
-        )
-    return text
-
-
 def may_be_read(path: Path) -> bool:
     """Return whether permissions allow to read a file, or to list a folder."""
     return os.access(path, os.R_OK | (os.X_OK if path.is_dir() else 0))
 
 
-def first_line(path: Path, comments: bool = False) -> str | None:
-    """Return the first line as in `first_lines`, None if there is none."""
-    return next(iter(first_lines(path, 1, comments)), None)
+def first_line(path: Path, comments: bool = False) -> str:
+    """Return the first line as in `first_lines`, empty if there is none."""
+    return next(iter(first_lines(path, 1, comments)), "")
 
 
 def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
@@ -140,11 +132,6 @@ def first_bytes(path: Path, count: int = 16) -> bytes:
             return file.read(count)
     except OSError:
         return b""
-
-
-def first_numbers(path: Path) -> list[float]:
-    """Return the first row's numbers, or an empty list if the first row is anything else."""
-    return numbers_in(first_line(path) or "")
 
 
 def numbers_in(line: str, delimiter: str | None = ",") -> list[float]:
@@ -187,7 +174,7 @@ def unquoted(line: str, delimiter: str | None, decimal: str = ".") -> str:
     """
     if '"' in line and delimiter is None:
         line = line.replace('"', " ")
-    elif '"' in line and delimiter is not None:
+    elif '"' in line and delimiter:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
         inner = "." if delimiter == decimal else " "
         line = delimiter.join(cell.replace(delimiter, inner) for cell in cells)
@@ -412,9 +399,8 @@ def read_table(
         except ReadError:
             cut = True
         if cut:
-            _log.warning(
-                "%s: skipped the last row, line %d, which is cut short", path, rows.pop()[0]
-            )
+            words = "%s: skipped the last row, line %d, which is cut short"
+            _log.warning(words, path, rows.pop()[0])
     try:  # several times as fast, but it neither knows blank cells nor explains what is wrong
         lines = [line for _, line in rows]
         used = [place.index for place in places]

@@ -25,7 +25,7 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path, PurePosixPath
@@ -173,10 +173,13 @@ def unpack_json(path: Path, folder: Path) -> None:
         raise ReadError(path, "sensor", "no name", "a sensor name in each object")
     for name, rows in sensors.items():
         titles = [title for title in rows[0] if title != "sensor"]
-        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as text:
-            writer = csv.DictWriter(text, titles, extrasaction="ignore")
-            writer.writeheader()
-            writer.writerows(rows)
+        _write(folder / name, [titles, *([row.get(title) for title in titles] for row in rows)])
+
+
+def _write(file: Path, rows: Iterable[Sequence[Any]]) -> None:
+    """Write rows of cells into a CSV of that name."""
+    with file.with_name(f"{file.name}.csv").open("w", newline="", encoding="utf-8") as text:
+        csv.writer(text, lineterminator="\n").writerows(rows)
 
 
 def is_long_form(path: Path) -> bool:
@@ -206,9 +209,7 @@ def unpack_long_form(path: Path, folder: Path) -> None:
         stem = re.sub(r"\W+", "_", "".join(row[column : column + 1])) or "unnamed"
         sensors.setdefault(stem, []).append(row)
     for stem, own in sensors.items():
-        kept = ([*row[:column], *row[column + 1 :]] for row in [*titles, *own])
-        text = "".join((written.delimiter or " ").join(row) + "\n" for row in kept)
-        (folder / f"{stem}.csv").write_text(text, encoding="utf-8")
+        _write(folder / stem, ([*row[:column], *row[column + 1 :]] for row in [*titles, *own]))
 
 
 def _column_of_sensors(lines: list[str]) -> tuple[RowFormat, int] | None:
@@ -282,13 +283,12 @@ def unpack_joined(path: Path, folder: Path, rate: str = "") -> None:
     InputError: the rate is not a number above zero.
     """
     if path.is_dir():
-        lines = _joined_files(path, rate)
+        rows = _joined_files(path, rate)
+    elif head := _head(path):
+        rows = _with_rate(head, rate) if rate or not _clock_columns(head) else _with_clock(head)
     else:
-        head = _head(path)
-        if head is None:
-            raise ReadError(path, "rows", "none of numbers", "samples of both sensors")
-        lines = _with_rate(head, rate) if rate or not _clock_columns(head) else _with_clock(head)
-    (folder / f"{path.stem}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        raise ReadError(path, "rows", "none of numbers", "samples of both sensors")
+    _write(folder / path.stem, rows)
 
 
 def _head(path: Path, least: int = 4) -> TableHead | None:
@@ -317,14 +317,14 @@ def _clock_columns(head: TableHead) -> dict[str, int]:
     return found if whole and clock_of(others, head.rows) is None else {}
 
 
-def _with_clock(head: TableHead) -> list[str]:
-    """Return the lines of a table with one column of times in place of several."""
+def _with_clock(head: TableHead) -> list[list[str]]:
+    """Return the rows of a table with one column of times in place of several."""
     columns = _clock_columns(head)
     used, titles = list(columns.values()), _titles(head)
     values = head.read([Column(k) for k in used]).values
     finite_rows(head.file, ", ".join(titles[k] for k in used), values, all_of_them=True)
     stamps = _stamps_ns(dict(zip(columns, values.T.astype(np.int64), strict=True)))
-    return _rewritten(head, "time [ns]", map(str, stamps.tolist()), set(used))
+    return _rewritten(head, "time [ns]", map(str, stamps.tolist()), used)
 
 
 def _stamps_ns(parts: dict[str, IntArray]) -> IntArray:
@@ -344,8 +344,8 @@ def _stamps_ns(parts: dict[str, IntArray]) -> IntArray:
     return np.asarray(seconds * 10**9 + parts["nano"], dtype=np.int64)
 
 
-def _with_rate(head: TableHead, rate: str) -> list[str]:
-    """Return the lines of a table whose rows are evenly spaced in time."""
+def _with_rate(head: TableHead, rate: str) -> list[list[str]]:
+    """Return the rows of a table whose rows are evenly spaced in time."""
     clock = clock_of(head.titles, head.rows)
     if not rate:
         found, expected = "no column of times that grow", "one next to the sensors'"
@@ -354,7 +354,7 @@ def _with_rate(head: TableHead, rate: str) -> list[str]:
     if clock is not None:
         fix = "omit the rate"
         raise ReadError(head.file, "time", f"the column {clock.title}", "none next to a rate", fix)
-    return _rewritten(head, "t [s]", _even_times(rate), set())
+    return _rewritten(head, "t [s]", _even_times(rate))
 
 
 def _even_times(rate: str) -> Iterator[str]:
@@ -364,21 +364,23 @@ def _even_times(rate: str) -> Iterator[str]:
     return (f"{k / hertz:.9f}" for k in range(2**31))
 
 
-def _rewritten(head: TableHead, title: str, times: Iterator[str], dropped: set[int]) -> list[str]:
-    """Return a table's lines with times in front, without some columns; line numbers are kept."""
+def _rewritten(
+    head: TableHead, title: str, times: Iterator[str], dropped: Collection[int] = ()
+) -> list[list[str]]:
+    """Return a table's rows with times in front, without some columns; line numbers are kept."""
 
-    def line(time: str, cells: list[str]) -> str:
-        kept = (cell.replace(",", " ") for k, cell in enumerate(cells) if k not in dropped)
-        return ",".join([time, *kept])
+    def row(time: str, cells: list[str]) -> list[str]:
+        return [time, *(cell for k, cell in enumerate(cells) if k not in dropped)]
 
-    rows = (head.row_format.cells(row) if is_row(row) else []
-            for row in read_lines(head.file)[head.row_format.skip :])  # fmt: skip
-    above = ["#"] * (head.row_format.skip - 1)
-    titles = line(title, _titles(head))
-    return [*above, titles, *(line(next(times, ""), row) if row else "#" for row in rows)]
+    above, below = [["#"]] * (head.row_format.skip - 1), read_lines(head.file)
+    rows = [
+        row(next(times, ""), head.row_format.cells(line)) if is_row(line) else ["#"]
+        for line in below[head.row_format.skip :]
+    ]
+    return [*above, row(title, _titles(head)), *rows]
 
 
-def _joined_files(folder: Path, rate: str) -> list[str]:
+def _joined_files(folder: Path, rate: str) -> list[list[str]]:
     """Return the rows of a folder's files side by side, their titles after the files' names."""
     tables = [_texts(file) for file in chain(*_sensor_files(folder).values())]
     if not tables or not (rate or _time_files(folder)):
@@ -395,7 +397,7 @@ def _joined_files(folder: Path, rate: str) -> list[str]:
         raise ReadError(folder, "files", found, "as many in the times as in each sensor's file")
     if len(set(lengths)) > 1:
         _log.warning("%s: its files have %d to %d rows", folder, min(lengths), max(lengths))
-    return [",".join(chain(*row)) for row in zip(*tables, strict=False)]
+    return [list(chain(*row)) for row in zip(*tables, strict=False)]
 
 
 def _texts(file: Path, least: int = 3) -> list[list[str]]:

@@ -15,14 +15,11 @@ from stario.sequences.readers.phones.files import (
     phone_recordings,
     sensors_in,
 )
-from stario.sequences.readers.phones.sensor_words import Sensor
 from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.text import first_bytes, first_line, first_lines, may_be_read
 from stario.sequences.readers.unpacking import is_echo
 
-_GYRO: tuple[Sensor, ...] = ("gyro",)
-_FORCE: tuple[Sensor, ...] = ("accel", "linear")
-
+_KNOWN = "a recording in a known format (`stario inspect --help` lists them)"
 _EXPORT = "export as CSV, or as the zip or folder that the app writes"
 _CONTAINERS = {
     b"SQLite format 3": "an SQLite database",
@@ -35,14 +32,11 @@ _CONTAINERS = {
 """First bytes of files that may hold a recording but are not unpacked, and their description."""
 
 
-def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
-    """Return an error that describes what was found instead of a recording.
-
-    There may be recordings `inside` a folder; `known` is what would have been one.
-    """
+def unrecognised(path: Path, inside: list[Path]) -> ReadError:
+    """Return an error that describes what was found instead of one recording, perhaps `inside`."""
     if inside:
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
-        return ReadError(path, "content", found, known, fix)
+        return ReadError(path, "content", found, _KNOWN, fix)
     if error := _incomplete(path):
         return error
     beside = phone_recordings(path.parent) if path.is_file() else []
@@ -61,7 +55,7 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
         if part.is_dir() and (error := _incomplete(part)):
             return error
     found, fix = _folder(path) if path.is_dir() else _file(path)
-    return ReadError(path, "content", found, known, fix)
+    return ReadError(path, "content", found, _KNOWN, fix)
 
 
 def _incomplete(path: Path) -> ReadError | None:
@@ -84,12 +78,12 @@ def _incomplete(path: Path) -> ReadError | None:
 
 def _of_several_devices(folder: Path) -> list[str]:
     """Return the names of gyroscope and accelerometer files, empty if a folder lacks either."""
-    tables = [group.tables for group in groups_of(folder)]
-    gyros, forces = (
-        {table.file.name for one in tables for kind in kinds for table in one.get(kind, [])}
-        for kinds in (_GYRO, _FORCE)
-    )
-    return sorted(gyros | forces) if gyros and forces else []
+    files: dict[str, set[str]] = {}
+    for group in groups_of(folder):
+        for sensor, tables in group.tables.items():
+            files.setdefault(sensor, set()).update(table.file.name for table in tables)
+    used = (files.get(sensor, set()) for sensor in ("gyro", "accel", "linear"))
+    return sorted(set().union(*used)) if is_complete(files) else []
 
 
 def _folder(path: Path) -> tuple[str, str]:
@@ -113,6 +107,6 @@ def _file(path: Path) -> tuple[str, str]:
         return "a pickle, which may run code", "save it as CSV or npy of plain numbers"
     if is_echo(first_lines(path, 1)):
         return "text of `rostopic echo`", "name the bag, or write it with `rostopic echo -p`"
-    if line is None:
+    if not line:
         return "no line of text", "is it empty or compressed?"
     return f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"

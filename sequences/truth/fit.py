@@ -231,15 +231,7 @@ class YawDrift:
 def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     """Fit scale and bias over the longest unbroken stretch of the part that `fit_truth` uses.
 
-    Args:
-        sequence: recording with ground truth.
-        fit: fit of that truth.
-
-    Returns:
-        The drift; None if the device turned too little.
-
-    Raises:
-        InputError: as for `clean_samples`.
+    None if the device turned too little. InputError as for `clean_samples`.
     """
     assert sequence.truth is not None  # a fit of it exists
     time, gyro, _ = clean_samples(middle_part(sequence))

@@ -72,16 +72,9 @@ class PositionFit:
 def fit_positions(sequence: ImuSequence, time_offset: float) -> PositionFit | None:
     """Compare the accelerations of positions and accelerometer over up to 10 minutes.
 
-    Args:
-        sequence: recording with ground truth whose attitude agrees with the gyroscope.
-        time_offset: offset to be added to the truth's time [s].
-
-    Returns:
-        The comparison; None if there is too little motion or overlap, or the positions are
-        constant.
-
-    Raises:
-        InputError: as for `clean_samples`, or fewer than two valid poses.
+    The true attitude agrees with the gyroscope if its time is moved by an offset [s]. None if there
+    is too little motion or overlap, or the positions are constant. InputError as for
+    `clean_samples`, or fewer than two valid poses.
     """
     assert sequence.truth is not None
     time, _, accel = compared_samples(sequence)

@@ -102,11 +102,7 @@ def examine_truth(sequence: ImuSequence, refusal: str = "") -> TruthFindings:
 
 
 def assess_truth(sequence: ImuSequence, refusal: str) -> tuple[Assessment, TruthFit | None]:
-    """Assess a recording's true poses or known positions; arguments as `examine_truth`.
-
-    Returns:
-        The assessment, and the fit of truth and gyroscope; None if they cannot be compared.
-    """
+    """Assess true poses or known positions; arguments and None of the fit as `examine_truth`."""
     found = examine_truth(sequence, refusal)
     findings, fit = [*found.findings], found.fit
     lines = [f"truth: {sequence.truth_summary()}"]
@@ -258,35 +254,22 @@ def tracked_truth(sequence: ImuSequence) -> tuple[Trajectory, list[Finding]]:
     for first, last in frozen:
         lost[known[first : last + 1]] = (quat[first : last + 1] == quat[first]).all(axis=1)
     truth = replace(truth, valid=truth.valid & ~lost) if lost.any() else truth
-    stretches = [(float(time[first]), float(time[last])) for first, last in frozen]
+    found = []
+    if stretches := [(float(time[first]), float(time[last])) for first, last in frozen]:
+        start, stop = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+        seconds = sum(b - a for a, b in stretches)
+        text = (
+            f"a position that repeats exactly for {seconds:.1f} s while the device moves, "
+            f"longest from {start:.1f} to {stop:.1f} s"
+        )
+        fix = "leave the truth's cells blank where its tracking is lost"
+        found.append(_truth_finding("frozen", text, fix, seconds=seconds, start_s=start))
     # The steps into and out of a frozen stretch are part of that fault.
-    leaps = _jumps(truth.time[truth.valid], truth.position_W[truth.valid])
-    found = [_frozen_finding(stretches)] if stretches else []
-    return truth, found + ([_jump_finding(leaps)] if leaps else [])
+    return truth, found + _jumps(truth.time[truth.valid], truth.position_W[truth.valid])
 
 
-def _frozen_finding(frozen: list[tuple[float, float]]) -> Finding:
-    start, stop = max(frozen, key=lambda stretch: stretch[1] - stretch[0])
-    seconds = sum(stop - start for start, stop in frozen)
-    text = (
-        f"a position that repeats exactly for {seconds:.1f} s while the device moves, "
-        f"longest from {start:.1f} to {stop:.1f} s"
-    )
-    fix = "leave the truth's cells blank where its tracking is lost"
-    return _truth_finding("frozen", text, fix, seconds=seconds, start_s=start)
-
-
-def _jump_finding(leaps: list[tuple[float, float]]) -> Finding:
-    at, length = max(leaps, key=lambda jump: jump[1])
-    count = len(leaps)
-    others = f", the longest of {count} jumps" if count > 1 else ""
-    text = f"a position that jumps by {length:.3g} m at {at:.2f} s{others}"
-    fix = "leave the truth's cells blank around a glitch, or split the recording there"
-    return _truth_finding("jumps", text, fix, count=count, longest_m=length)
-
-
-def _jumps(time: FloatArray, position: FloatArray) -> list[tuple[float, float]]:
-    """Return time [s] and length [m] of each jump of the positions (N, 3)."""
+def _jumps(time: FloatArray, position: FloatArray) -> list[Finding]:
+    """Report the longest jump of the positions (N, 3)."""
     if len(time) < _NEIGHBOURS:
         return []
     steps, lengths = np.diff(time), np.linalg.norm(np.diff(position, axis=0), axis=1)
@@ -294,7 +277,14 @@ def _jumps(time: FloatArray, position: FloatArray) -> list[tuple[float, float]]:
     usual = median_filter(speeds, _NEIGHBOURS, mode="nearest")
     jump = (lengths > _JUMP_M) & (speeds > _FASTEST_M_S) & (speeds > _FASTER * usual)
     jump &= ~is_gap(steps)
-    return [(float(time[k + 1]), float(lengths[k])) for k in np.flatnonzero(jump)]
+    if not jump.any():
+        return []
+    longest, count = int(np.argmax(np.where(jump, lengths, 0.0))), int(jump.sum())
+    at, length = time[longest + 1], float(lengths[longest])
+    others = f", the longest of {count} jumps" if count > 1 else ""
+    text = f"a position that jumps by {length:.3g} m at {at:.2f} s{others}"
+    fix = "leave the truth's cells blank around a glitch, or split the recording there"
+    return [_truth_finding("jumps", text, fix, count=count, longest_m=length)]
 
 
 def _moves(sequence: ImuSequence, start: float, stop: float) -> bool:
@@ -381,22 +371,15 @@ def _assessed_fit(fit: TruthFit, yaw: YawDrift | None) -> Assessment:
         f"residual {math.degrees(yaw.residual_rms):.1f} deg"
     )
     same_frames = fit.misalignment < _TURNED_RAD and fit.tilt < _LEANING_RAD  # else yaws differ
-    wrong = abs(yaw.scale) > _SCALED and fit.consistent and same_frames
-    if yaw.residual_rms > _EXPLAINED_RAD and abs(yaw.scale) < _UNMISTAKABLE:
-        wrong = False
+    jumped = yaw.residual_rms > _EXPLAINED_RAD and abs(yaw.scale) < _UNMISTAKABLE
+    wrong = abs(yaw.scale) > _SCALED and fit.consistent and same_frames and not jumped
     text = f"gyroscope: {reads}, compared with the truth"
     found = [Finding("gyro_scale", text, values={"scale": yaw.scale})] if wrong else []
     return Assessment(figures, lines, found)
 
 
 def fit_findings(fit: TruthFit, refusal: str) -> list[Finding]:
-    """Return what stands out where truth and gyroscope are compared.
-
-    Args:
-        fit: the comparison.
-        refusal: remedy for units or signs for which the recording is refused; what it explains is
-            not told again.
-    """
+    """Return what stands out where truth and gyroscope are compared, but a `refusal`'s causes."""
     if fit.one_axis:  # a single axis, as of a robot on wheels, fits any mount about it
         return []
     if not fit.consistent:
@@ -507,8 +490,7 @@ def _axes_fix(fit: PositionFit) -> str:
 
 
 def _jumps_of_positions(track: PositionTrack | None) -> list[Finding]:
-    lengths = [] if track is None else jumps(track).tolist()
-    if not lengths:
+    if track is None or not (lengths := jumps(track).tolist()):
         return []
     text = f"positions: found jumps of up to {max(lengths):.0f} m, expected a path at walking speed"
     fix = "satellite positions are poor indoors"

@@ -81,26 +81,19 @@ class Recording:
     start_ns: np.int64
     stop_ns: np.int64
 
+    def within(self, table: Table, known: BoolArray) -> tuple[IntArray, FloatArray]:
+        """Return which `known` rows hold something new while it lasts, and their times [s].
 
-@dataclass(frozen=True)
-class _Columns:
-    """A table with its clock and columns by quantity; `held` if rows repeat the last values."""
-
-    table: Table
-    places: dict[str, Column]
-    held: bool
-
-    def within(self, known: BoolArray, recording: Recording) -> tuple[IntArray, FloatArray]:
-        """Return which `known` rows hold something new within a recording, and their times [s]."""
-        table = self.table
-        if self.held:
+        Rows beside those of the sensors repeat the last values.
+        """
+        if table.path == self.sensors:
             values = table.values[:, 1:]
             same = (values[1:] == values[:-1]) | np.isnan(values[1:]) & np.isnan(values[:-1])
             known = known & np.append(True, ~same.all(axis=1))
         rows = np.flatnonzero(known)
         if not len(rows):
             return rows, np.zeros(0)
-        start_ns, stop_ns = recording.start_ns, recording.stop_ns
+        start_ns, stop_ns = self.start_ns, self.stop_ns
         unit = TIME_UNITS.get(table.columns[0].unit)
         if unit is None and len(rows) > 1:
             unit = unit_within(table.path, table.values[rows, 0], start_ns, stop_ns)
@@ -121,7 +114,7 @@ def _read_alongside(
     words: str,
     names: set[str],
     places_in: Callable[[TableHead, bool], dict[str, Column]],
-    read: Callable[[_Columns, Recording], Kind | None],
+    read: Callable[[Recording, Table, dict[str, Column]], Kind | None],
 ) -> Iterator[Kind]:
     """Yield what is read from a recording's tables, its own first; none is worth the recording.
 
@@ -140,7 +133,7 @@ def _read_alongside(
                 continue
             try:
                 table = head.read([head.clock(clock), *places.values()])
-                found = read(_Columns(table, places, held=own), recording)
+                found = read(recording, table, places)
             except ReadError as error:
                 _log.warning("%s skipped: %s", words, error)
                 break
@@ -169,9 +162,9 @@ def recorded_pressure(recording: Recording) -> Barometer | None:
     return next(found, None)
 
 
-def _pressure(columns: _Columns, recording: Recording) -> Barometer | None:
-    table, place = columns.table, columns.places["pressure"]
-    rows, time = columns.within(np.isfinite(table.values[:, 1]), recording)
+def _pressure(recording: Recording, table: Table, places: dict[str, Column]) -> Barometer | None:
+    place = places["pressure"]
+    rows, time = recording.within(table, np.isfinite(table.values[:, 1]))
     return checked.barometer(table.path, place.name, time, table.values[rows, 1], place.unit)
 
 
@@ -231,14 +224,13 @@ def _place_of(words: set[str]) -> str:
     return next((place for place, names in _TITLES.items() if names & words), "")
 
 
-def _satellites(columns: _Columns, recording: Recording) -> Satellites | None:
-    table, places = columns.table, columns.places
+def _satellites(recording: Recording, table: Table, places: dict[str, Column]) -> Satellites | None:
     for title in (places["latitude"].title, places["longitude"].title):
         if unit_of(title).startswith("rad"):
             raise ReadError(table.path, "latitude, longitude", title, "degrees")
     values = table.values[:, 1:]
     latlon_deg = checked.in_degrees(table.path, values[:, :2])
-    rows, time = columns.within(checked.known_places(latlon_deg), recording)
+    rows, time = recording.within(table, checked.known_places(latlon_deg))
     rest = {
         name: checked.UNITS[name][place.unit] * values[rows, k]
         for k, (name, place) in enumerate(places.items())

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
@@ -31,7 +30,7 @@ from stario.sequences.geodesy import east_north
 from stario.sequences.readers.checked import barometer, finite_rows, satellites
 from stario.sequences.readers.clocks import Samples, joined_sequence
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
-from stario.sequences.readers.text import IntArray, head_lines, read_lines
+from stario.sequences.readers.text import head_lines, read_lines
 from stario.sequences.sequence import ImuSequence, PositionTrack
 from stario.sequences.time_order import increasing_mask
 
@@ -91,8 +90,12 @@ def read_event_lines(path: Path) -> ImuSequence:
     sequence, start_ns = joined_sequence(
         path, path.stem, sensors["gyro"], sensors["accel"], sensors.get("mag")
     )
-    attitude = _attitude(sensors["vectors"], sensors["gyro"]) if "vectors" in sensors else None
-    own, parts = device_attitude(attitude, start_ns), dict[str, Any]()
+    parts = dict[str, Any]()
+    if vectors := sensors.get("vectors"):
+        w = np.sqrt(np.clip(1.0 - np.sum(vectors.values**2, axis=1), 0.0, None))
+        quat = np.column_stack([vectors.values, w])
+        own = agreeing_attitude(vectors.stamps_ns, quat, sensors["gyro"])
+        parts["device_attitude"] = device_attitude(own, start_ns)
     if pressure := sensors.get("pressure"):
         time, values = pressure.seconds(start_ns), pressure.values[:, 0]
         parts["barometer"] = barometer(path, "PRES", time, values)
@@ -102,7 +105,7 @@ def read_event_lines(path: Path) -> ImuSequence:
         place = reported.values[:, :2]
         parts["satellites"] = satellites(reported.seconds(start_ns), place, rest)
     positions = _waypoints(sensors, start_ns)
-    return replace(sequence, device_attitude=own, positions=positions, **parts)
+    return replace(sequence, positions=positions, **parts)
 
 
 def is_event_lines(path: Path) -> bool:
@@ -110,11 +113,6 @@ def is_event_lines(path: Path) -> bool:
     if not path.is_file() or path.suffix.lower() not in (".txt", ".csv", ".log"):
         return False
     return any(_TRACE.match(line) or _EVENT.match(line) for line in head_lines(path))
-
-
-def _attitude(vectors: Samples, gyro: Samples) -> tuple[IntArray, Rotation] | None:
-    w = np.sqrt(np.clip(1.0 - np.sum(vectors.values**2, axis=1), 0.0, None))
-    return agreeing_attitude(vectors.stamps_ns, np.column_stack([vectors.values, w]), gyro)
 
 
 def _waypoints(sensors: dict[str, Samples], start_ns: np.int64) -> PositionTrack | None:

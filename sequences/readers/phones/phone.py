@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import Samples, resample_to_gyro, source_words
+from stario.sequences.readers.clocks import Samples, resample_to_gyro
 from stario.sequences.readers.columns import IMU, POSITION, named_columns
 from stario.sequences.readers.phones import alongside
 from stario.sequences.readers.phones.attitude import (
@@ -211,7 +211,7 @@ def assemble_recording(
         device_attitude=device_attitude(attitude, stamps[0]),
         barometer=alongside.recorded_pressure(recording),
         satellites=first,
-        source="" if core_motion else source_words(app_of(files), gyro.assumed_time_unit),
+        source="" if core_motion else app_of(files) + gyro.assumed,
         maybe_apple=maybe_apple,
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)

@@ -34,13 +34,19 @@ def read_euroc(path: Path) -> ImuSequence:
     if imu is None:
         expected = "an EuRoC or TUM-VI folder with its IMU"
         raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
-    _check_titles(imu)
+    header = first_line(imu, comments=True)
+    names = canonical_names(header)
+    if set(names) >= {"t", *IMU} and names[:7] != ["t", *IMU]:
+        expected = "time, gyroscope xyz and accelerometer xyz first"
+        fix = f"read {imu.name} itself with `--format csv`, by its titles"
+        raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
     table = read_table(imu, columns=7)
     stamps = table.stamps_ns(_unit_ns(imu))
     truth_files = (imu.parent.parent / folder / "data.csv" for folder in TRUTH_FOLDERS)
     truth_file = next((file for file in truth_files if file.is_file()), None)
+    folder = imu.resolve().parent.parent
     return ImuSequence(
-        name=_name(imu),
+        name=folder.parent.name if folder.name == "mav0" else folder.name,
         time=seconds(stamps, stamps[0]),
         gyro=table.values[:, 1:4],
         accel=table.values[:, 4:7],
@@ -48,23 +54,9 @@ def read_euroc(path: Path) -> ImuSequence:
     )
 
 
-def _check_titles(imu: Path) -> None:
-    """Check that a header which names the IMU's columns has them in EuRoC's order."""
-    header = _header(imu)
-    names = canonical_names(header)
-    if set(names) >= {"t", *IMU} and names[:7] != ["t", *IMU]:
-        expected = "time, gyroscope xyz and accelerometer xyz first"
-        fix = f"read {imu.name} itself with `--format csv`, by its titles"
-        raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
-
-
-def _header(path: Path) -> str:
-    return first_line(path, comments=True) or ""
-
-
 def _unit_ns(path: Path) -> int:
     """Return the unit of a file's times [ns], nanoseconds unless its title names another."""
-    return TIME_UNITS.get(time_unit_of(_header(path).split(",")[0]), 1)
+    return TIME_UNITS.get(time_unit_of(first_line(path, comments=True).split(",")[0]), 1)
 
 
 def is_euroc(path: Path) -> bool:
@@ -80,15 +72,10 @@ def imu_file(path: Path) -> Path | None:
     return next((c for c in candidates if c.is_file() and c.parent.name.startswith("imu")), None)
 
 
-def _name(imu: Path) -> str:
-    folder = imu.resolve().parent.parent
-    return folder.parent.name if folder.name == "mav0" else folder.name
-
-
 def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     # Some copies of EuRoC's files lack the velocity; TUM-VI's never have it.
     estimated = path.parent.name.startswith("state_groundtruth")
-    columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
+    columns = 11 if estimated and first_line(path).count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
     table, time = rows.values, seconds(rows.stamps_ns(_unit_ns(path)), start_ns)
     keep = pose_mask(path, time)

@@ -25,7 +25,7 @@ from stario.sequences.sequence import FloatArray
 MAGNETIC = "magnetic"
 
 
-class Fields:
+class Fields(dict[str, FloatArray]):
     """Arrays (N,) or (N, K) of a file by name, without rows with a value that is not finite.
 
     Those that are optional may be missing, or hold NaN; errors count rows from `first_row`.
@@ -38,26 +38,15 @@ class Fields:
         optional: Collection[str] = (),
         first_row: int = 0,
     ) -> None:
-        self._path, self._first_row = path, first_row
         needed = {name: values for name, values in arrays.items() if name not in optional}
         damaged = ", ".join(name for name, one in needed.items() if not np.isfinite(one).all())
         self.rows = finite_rows(path, damaged, np.column_stack(list(needed.values())))
-        self._kept = {name: values[self.rows] for name, values in arrays.items()}
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._kept
-
-    def __getitem__(self, name: str) -> FloatArray:
-        return self._kept[name]
-
-    def optional(self, name: str) -> FloatArray | None:
-        """Return an array, None if it is missing."""
-        return self._kept.get(name)
+        self._path, self._numbers = path, self.rows + first_row
+        super().__init__((name, values[self.rows]) for name, values in arrays.items())
 
     def rotations(self, name: str, order: str = "wxyz", count: int | None = None) -> Rotation:
         """Return the rotations of unit quaternions (N, 4), or of the first few."""
-        numbers = self.rows + self._first_row
-        return rotations(self._path, name, self._kept[name][:count], order, numbers)
+        return rotations(self._path, name, self[name][:count], order, self._numbers)
 
 
 def file_in(path: Path, *names: str) -> Path | None:
@@ -69,7 +58,7 @@ def file_in(path: Path, *names: str) -> Path | None:
 
 def header_names(path: Path) -> list[str]:
     """Return the cells of a file's first line, [""] for a file that is not text; never raises."""
-    return [cell.strip().strip('"') for cell in (first_line(path) or "").split(",")]
+    return [cell.strip().strip('"') for cell in first_line(path).split(",")]
 
 
 def read_columns(

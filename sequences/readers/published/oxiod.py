@@ -33,8 +33,8 @@ from stario.sequences.readers.clocks import Samples, joined_sequence, time_unit
 from stario.sequences.readers.text import (
     IntArray,
     Table,
+    first_line,
     first_lines,
-    first_numbers,
     numbers_in,
     read_table,
     seconds,
@@ -67,7 +67,7 @@ def read_oxiod(path: Path) -> ImuSequence:
 
 def is_oxiod(path: Path) -> bool:
     """Return whether a file starts with 16 numbers, with gravity of 1 g, or with sensor codes."""
-    row = first_numbers(path)
+    row = numbers_in(first_line(path))
     apple = len(row) == 16 and abs(float(np.linalg.norm(row[7:10])) - 1.0) < 0.05
     return apple or _is_sensor_rows(path)
 
@@ -128,7 +128,7 @@ def capture_file(path: Path) -> Path | None:
 
 
 def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Trajectory | None:
-    table = read_table(path, columns=max(8, len(first_numbers(path))))
+    table = read_table(path, columns=max(8, len(numbers_in(first_line(path)))))
     time, kept = phone.time, np.arange(len(table.values))
     if start_ns is not None:
         stamps, kept = np.unique(_stamps_ns(table), return_index=True)

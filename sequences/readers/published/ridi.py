@@ -62,13 +62,14 @@ def read_ridi(path: Path) -> ImuSequence:
     attitude_WB = pose[0] * game_rv[0].inv() * game_rv
     if _y_is_up(file, attitude_WB, fields["acce"]):
         attitude_WB = _UPRIGHT * attitude_WB
+    folder = file.resolve().parent
     return ImuSequence(
-        name=_name(file),
+        name=folder.parent.name if folder.name == "processed" else folder.name,
         time=time,
         gyro=fields["gyro"],
         accel=fields["acce"],
         truth=trajectory(file, time, fields["pos"], attitude_WB),
-        magnetometer=magnetometer(time, fields.optional(MAGNETIC)),
+        magnetometer=magnetometer(time, fields.get(MAGNETIC)),
     )
 
 
@@ -99,11 +100,6 @@ def _y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
         tilt = np.degrees(np.arccos(np.clip(cosines[2], -1.0, 1.0)))
         _log.warning("%s: with its poses, specific force is %.0f degrees off vertical", path, tilt)
     return bool(cosines[1] > cosines[2])
-
-
-def _name(file: Path) -> str:
-    folder = file.resolve().parent
-    return folder.parent.name if folder.name == "processed" else folder.name
 
 
 def read_imunet(path: Path) -> ImuSequence:
@@ -137,7 +133,7 @@ def _samples(path: Path, width: int) -> Samples:
 
 def _field(path: Path) -> Samples | None:
     """Return the magnetometer's samples, also those that are not finite: it is optional."""
-    if not path.is_file() or first_line(path) is None:
+    if not path.is_file() or not first_line(path):
         return None
     table = read_table(path, 4, RowFormat(delimiter=None))
     return Samples(table.stamps_ns(), table.values[:, 1:])

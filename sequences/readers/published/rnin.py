@@ -37,13 +37,14 @@ def read_rnin(path: Path) -> ImuSequence:
     clock = "times" if "times" in header_names(file) else "time"
     time, fields = read_columns(file, (clock, 10**9), _STEMS, _MAGNETIC)
     source = "gt" if (np.ptp(fields["gt_q"], axis=0) > 0).any() else "vio"
+    folder = file.resolve().parent  # numbers restart in each folder: `data_train-12`
     return ImuSequence(
-        name=_name(file),
+        name=f"{folder.parent.name}-{folder.name}" if folder.name.isdecimal() else folder.name,
         time=time,
         gyro=fields["gyro"] - fields["vio_gyro_bias"][-1],
         accel=fields["acce"] - fields["vio_acce_bias"][-1],
         truth=trajectory(file, time, fields[f"{source}_p"], fields.rotations(f"{source}_q")),
-        magnetometer=magnetometer(time, fields.optional(MAGNETIC)),
+        magnetometer=magnetometer(time, fields.get(MAGNETIC)),
     )
 
 
@@ -52,9 +53,3 @@ def is_rnin(path: Path) -> bool:
     if path.is_dir():
         return (path / _FILE).is_file()
     return path.name == _FILE or len(set(_OWN) & set(header_names(path))) >= 2
-
-
-def _name(file: Path) -> str:
-    """Return the name of a recording: `data_train-12`, as numbers restart in each folder."""
-    folder = file.resolve().parent
-    return f"{folder.parent.name}-{folder.name}" if folder.name.isdecimal() else folder.name

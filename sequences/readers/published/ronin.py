@@ -56,7 +56,7 @@ def read_ronin(path: Path) -> ImuSequence:
     if not isinstance(frame, int) or not 0 <= frame <= last:
         raise ReadError(info.path, "start_frame", repr(frame), f"a row from 0 to {last}")
     used = slice(int(np.searchsorted(fields.rows, frame)), None)
-    time, field = fields[_TIME][used], fields.optional(_MAGNETIC)
+    time, field = fields[_TIME][used], fields.get(_MAGNETIC)
     time = time - time[0]
     return ImuSequence(
         name=file.resolve().parent.name,
@@ -91,19 +91,14 @@ def _fields(file: Path) -> Fields:
 def _device_attitude(info: JsonFields, fields: Fields, gyro: FloatArray) -> Rotation:
     """Return the phone's attitude in the Tango's world, from the source the authors would use."""
     game_rv = fields.rotations(_GAME_RV)
-    name = _source(info, fields)
+    known = [name for name in _ERRORS if name in fields or name == "gyro"]
+    given = [name for name in known if info.get(_ERRORS[name]) is not None]
+    errors = {name: float(info.array(_ERRORS[name])) for name in given}
+    trusted = errors.get(_GAME_RV, 0.0) <= _TRUSTED_DEG
+    name = _GAME_RV if trusted else min(errors, key=lambda name: errors[name])
     if name == "gyro":
         source = game_rv[0] * integrated_gyro(fields[_TIME], gyro)
     else:
         source = game_rv if name == _GAME_RV else fields.rotations(name)
     first = fields.rotations(_ATTITUDE, count=1)[0]
     return first * info.rotation("start_calibration") * source[0].inv() * source
-
-
-def _source(info: JsonFields, fields: Fields) -> str:
-    known = [name for name in _ERRORS if name in fields or name == "gyro"]
-    given = [name for name in known if info.get(_ERRORS[name]) is not None]
-    errors = {name: float(info.array(_ERRORS[name])) for name in given}
-    if errors.get(_GAME_RV, 0.0) <= _TRUSTED_DEG:
-        return _GAME_RV
-    return min(errors, key=lambda name: errors[name])

@@ -71,7 +71,7 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
     time = (us - us[0]) * 1e-6
     if not _in_body_axes(time, gyro, attitude_WB):
         gyro, accel = (attitude_WB.apply(values, inverse=True) for values in (gyro, accel))
-    truth = trajectory(file, time, fields[_POSITION], attitude_WB, fields.optional(_VELOCITY))
+    truth = trajectory(file, time, fields[_POSITION], attitude_WB, fields.get(_VELOCITY))
     sequence = ImuSequence(file.resolve().parent.name, time, gyro, accel, truth)
     return np.rint(us).astype(np.int64), sequence
 
