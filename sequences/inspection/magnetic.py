@@ -75,7 +75,7 @@ _HALF_SECOND, _TURNED_RAD = 0.5, 0.05
 """Half seconds in which the field turns by more than this in the sensor's axes are examined."""
 
 _COVERED = 0.9
-"""Share of a recording's seconds with a field below which the summary says how many there are."""
+"""Share of the IMU's seconds with a field below which the summary says how many there are."""
 
 
 def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
@@ -92,6 +92,7 @@ def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
     if sequence.magnetometer is None:
         return None
     time, gyro, accel = clean_samples(sequence)
+    first, seconds = time[0], np.unique(np.floor(time[:-1] - time[0]))  # without those of gaps
     part = longest_unbroken(time)
     count = int(np.searchsorted(time[part], time[part.start] + _LONGEST_S))
     time, gyro, accel = (values[part][:count] for values in (time, gyro, accel))
@@ -127,8 +128,8 @@ def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
         "levelled_bearing_rms_rad": spread,
         "gyroscope_drift_rad_s": drift,
         "held_share": _held(stamps, values),
-        "covered_s": float(len(np.unique(np.floor(field.time - sequence.time[0])))),
-        "recording_s": sequence.duration,
+        "covered_s": float(np.isin(seconds, np.floor(field.time - first)).sum()),
+        "recording_s": float(len(seconds)),
     }
     figures["verdict"] = _verdict(figures)
     return Assessment(figures, _lines(figures), _findings(figures, certain))
