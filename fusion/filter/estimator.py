@@ -239,7 +239,7 @@ def _with_height(s: EstimatorState, interval: ImuInterval) -> EstimatorState:
     """Update with the height by the pressure, and note whether it climbs."""
     sample = interval.height
     if sample is None:
-        return s
+        return changed(s, climb_rate=height.UNKNOWN_RATE) if height.silent(s.ekf) else s
     after, result = height.with_height(s.ekf, sample)
     if s.alternative is not None:
         other, _ = height.with_height(s.alternative.ekf, sample)

@@ -18,7 +18,7 @@ from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_pose
 from stario.fusion.filter.frame_transform import MapFrameState, to_final_frame, with_unknown_yaws
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.innovations import InnovationStatistics
-from stario.fusion.filter.magnetic import MagneticReference
+from stario.fusion.filter.magnetic import MagneticReference, north_contradiction
 from stario.fusion.filter.record import UpdateCounts
 from stario.fusion.filter.zero_velocity import Stillness
 from stario.fusion.imu.inference import WindowDisplacement
@@ -132,8 +132,13 @@ class EstimatorState:
         health = self.counts.health(counts, state or self.nav_state())
         health.accel_noise_factor = self.statistics.accel_factor
         health.network_error_level = self.statistics.error_level
-        if f.declination is not None and not self.map_frame.yaw_known:
+        if f.declination is None:
+            return health
+        if not self.map_frame.yaw_known:
             health.notes.append("north could not be determined: the track starts with yaw zero")
+        else:
+            known = self.ekf, self.magnetic.count, f.declination
+            health.north_contradiction = north_contradiction(*known)
         return health
 
 

@@ -21,7 +21,7 @@ from stario.fusion.filter.ekf_state import EkfState, PressureOffset
 from stario.fusion.filter.jacobians import position_jacobian, velocity_jacobian
 from stario.fusion.filter.kalman import Linear, UpdateResult, update
 from stario.fusion.filter.zero_velocity import ZeroVelocity
-from stario.fusion.imu.barometer import HeightSample
+from stario.fusion.imu.barometer import CLIMB_DELAY, HEIGHT_SECONDS, HeightSample
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -44,6 +44,10 @@ STAIRS_SLOPE = 0.6
 
 _PATH, _STAIRS = 0.08, 0.2
 """Slopes by the network's speed up to which one is on a path, and from which on stairs."""
+
+UNKNOWN_RATE = 1e-3
+"""Vertical speed that stands for one that is not known [m/s], as where the pressure is silent or
+shows only how high a climb was: the height yields, the length does not."""
 
 WALKING = 0.4
 """Speed by the network [m/s] above which one walks on stairs, below which one stands in a lift."""
@@ -70,7 +74,8 @@ def yielding(displacement: WindowDisplacement, rate: float) -> WindowDisplacemen
 
     Args:
         displacement: the network's.
-        rate: vertical speed by the pressure while one climbs [m/s]; 0 on a floor.
+        rate: vertical speed by the pressure while one climbs [m/s]; 0 on a floor, `UNKNOWN_RATE` if
+            it is not known whether one climbs.
     """
     covariance_N, d_N = displacement.covariance_N.copy(), displacement.d_N
     covariance_N[2, 2] += (CLIMB_SIGMA if rate else LEVEL_SIGMA) ** 2
@@ -81,6 +86,11 @@ def yielding(displacement: WindowDisplacement, rate: float) -> WindowDisplacemen
         share = 1.0 - on_stairs + on_stairs * min(1.0, slope / STAIRS_SLOPE)
         d_N = d_N * np.array([share, share, 1.0])
     return displacement._replace(d_N=d_N, covariance_N=covariance_N)
+
+
+def silent(s: EkfState) -> bool:
+    """Return whether there was a pressure, but none for as long as it takes to know a climb."""
+    return s.offset is not None and s.time - s.offset.time > CLIMB_DELAY + HEIGHT_SECONDS
 
 
 def resting_in_lift(measured: ZeroVelocity) -> ZeroVelocity:

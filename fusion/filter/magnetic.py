@@ -202,6 +202,24 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
     return yaw_fix(s.time, math.remainder(yaw + turn, 2.0 * math.pi), sigma)
 
 
+def north_contradiction(s: EkfState, count: int, declination: float) -> float:
+    """Return the angle from magnetic north to the north of a track that is oriented [rad].
+
+    Args:
+        s: the filter's state.
+        count: number of bearings so far.
+        declination: angle from true to magnetic north, positive east [rad].
+
+    Returns:
+        0 if both agree within three sigma, or if magnetic north is not known.
+    """
+    if s.field is None or count < _MIN_NORTH_COUNT:
+        return 0.0
+    apart = math.remainder(s.field.azimuth - (math.pi / 2.0 - declination), 2.0 * math.pi)
+    variance = s.P_reported[s.field_row, s.field_row] + NORTH_SIGMA**2
+    return apart if apart**2 > 9.0 * variance else 0.0
+
+
 def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
     """Return the state with an unknown azimuth, initialised by the first field (3,) [uT]."""
     x, y, _ = s.R_WB @ m_B

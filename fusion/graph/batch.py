@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, frame_rotation
+from stario.fusion.filter.height import UNKNOWN_RATE
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
@@ -27,9 +28,9 @@ _UNKNOWN_POSITION = 1e4
 _RATE_SECONDS, _LEAST_HEIGHTS = 1.5, 3
 """Time before and after the middle of a window [s], and number of heights, for their slope."""
 
-_LEAST_CLIMB, _SLOW = 0.8, 1e-3
-"""Height [m] below which a climb may be none, and its speed then [m/s]: its height yields to the
-pressure's, its length does not."""
+_LEAST_CLIMB = 0.8
+"""Height [m] below which a climb may be none: its height yields to the pressure's, its length does
+not."""
 
 CLOSURE_SIGMA = 1.0
 """Standard deviation [m] per axis of a walk's end, relative to the start at which it ends."""
@@ -119,17 +120,17 @@ def _with_climbs(records: Sequence[Record]) -> list[Record]:
     for record, climbing, known, at in zip(records, climbs, stairs, middle, strict=True):
         rate = record.climb_rate
         if rate is not None and climbing:
-            rate = _rate(time, height, at) if known else _SLOW
+            rate = _rate(time, height, at) if known else UNKNOWN_RATE
         found.append(record.at_rate(rate))
     return found
 
 
 def _rate(time: FloatArray, height: FloatArray, at: float) -> float:
-    """Return the slope of heights (N,) about a time [m/s]; 0 where there are too few."""
+    """Return the slope of heights (N,) about a time [m/s]; unknown where there are too few."""
     rows = slice(*np.searchsorted(time, (at - _RATE_SECONDS, at + _RATE_SECONDS)))
     t, h = time[rows] - at, height[rows]
     if len(t) < _LEAST_HEIGHTS:
-        return 0.0
+        return UNKNOWN_RATE
     t = t - t.mean()
     return float(t @ h / (t @ t))
 

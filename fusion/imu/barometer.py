@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from operator import itemgetter
 from statistics import median
 from typing import NamedTuple
 
@@ -57,6 +58,11 @@ _NO_DOOR, _STILL_MOVING = 1.2, 0.2
 _CLEAR_STEP = 0.4
 """Squared residuals about a step, relative to those about the line, below which the air has
 stepped: a door, a ventilator. Whoever climbs slowly must not be mistaken for one."""
+
+_MAX_REPEATED, _COARSE = 3.0, 0.03
+"""Time for which a pressure may repeat itself [s], three samples of the slowest phones (real ones:
+at most 2.1 s), and resolution [hPa] from which on a sensor's noise may hide in one step, so that
+repeating says nothing. A finer sensor, or one that has never changed, has then stopped."""
 
 _FIRST_SCATTER, _MIN_SCATTER = 0.1, 0.02
 """Scatter of averaged heights about their line [m]: assumed at first, and the least."""
@@ -110,12 +116,27 @@ class HeightBuffer(TimedBuffer[float]):
         self._variance, self._count = _FIRST_SCATTER**2, 0
         self._doubt: tuple[float, float] | None = None  # time and height before a sudden change
         self._climbing = False
+        self._pressure, self._since, self._step = math.nan, math.inf, math.inf
+        self._heard = math.nan
+        self.silence = (0.0, 0.0)
+        """Start and length [s] of the longest time without a usable pressure."""
 
     def add(self, time: float, pressure_hPa: float, now: float) -> bool:
-        """Add a pressure [hPa]; return False if it or its time cannot be right (see `fits`)."""
+        """Add a pressure [hPa]; return False if it, its time or its sensor cannot be right.
+
+        So it does if too many wait; `now` is as for `fits`.
+        """
         low, high = PRESSURE_RANGE
-        right = low <= pressure_hPa <= high and self.fits(time, now)
-        return right and self.keep(time, pressure_hPa)
+        if not (low <= pressure_hPa <= high and self.fits(time, now)):
+            return False
+        if pressure_hPa != self._pressure:
+            if math.isnan(self._heard):
+                self._heard = time
+            else:
+                self._step = min(self._step, abs(pressure_hPa - self._pressure))
+            self._pressure, self._since = pressure_hPa, time
+        held = not self._rounding and time - self._since > _MAX_REPEATED
+        return not held and self.keep(time, pressure_hPa)
 
     def at(self, stop: float) -> HeightSample | None:
         """Return the height of the half second before a time [s]; None if there is none to be used.
@@ -126,8 +147,10 @@ class HeightBuffer(TimedBuffer[float]):
         while self._waiting and self._waiting[0][0] <= stop:
             taken.append(self._waiting.popleft())
         taken = [each for each in taken if each[0] > stop - HEIGHT_SECONDS]
-        if not taken:
+        if not taken or math.isinf(self._step):  # how finely it measures is not known yet
+            self.silence = max(self.silence, (self._heard, stop - self._heard), key=itemgetter(1))
             return None
+        self._heard = stop
         times, pressures = np.array(taken).T
         altitude, time = float(pressure_altitude(pressures).mean()), float(times.mean())
         if math.isnan(self._first):
@@ -154,7 +177,8 @@ class HeightBuffer(TimedBuffer[float]):
         if line is not None and self._climbing:
             risen = 0.0 if climbed else height - (doubt or began)[1]
             return sample._replace(rate=line.slope, risen=risen)
-        if doubt is None and abs(height - usual) > _SUDDEN and not climbed:
+        sudden = max(_SUDDEN, 1.5 * self._rounding)
+        if doubt is None and abs(height - usual) > sudden and not climbed:
             doubt = time, usual
         if doubt is not None and time - doubt[0] < _LONGEST_DOUBT:
             self._doubt = doubt
@@ -167,14 +191,22 @@ class HeightBuffer(TimedBuffer[float]):
         return sample
 
     @property
+    def _rounding(self) -> float:
+        """Resolution of a coarse sensor as a height [m]; 0 for others."""
+        if not _COARSE < self._step < math.inf:
+            return 0.0
+        ends = np.array([self._pressure - self._step, self._pressure])
+        return float(-np.diff(pressure_altitude(ends))[0])
+
+    @property
     def _sigma(self) -> float:
-        return math.sqrt(_CORRELATION * self._variance)
+        return math.sqrt(_CORRELATION * self._variance + self._rounding**2 / 12.0)
 
     def _is_climb(self, line: _Line, climbed: bool) -> bool:
         if climbed:
             return abs(line.slope) > _STILL_CLIMBING
         # Over n heights at equal steps the slope's sigma is the mean's times sqrt(12) / span.
-        sigma = math.sqrt(12.0 * _CORRELATION * self._variance / len(self._past)) / CLIMB_DELAY
+        sigma = math.sqrt(12.0 / len(self._past)) * self._sigma / CLIMB_DELAY
         least = max(MIN_CLIMB_RATE, _CLIMB_SIGMAS * sigma)
         return abs(line.slope) > least and line.step_ratio > 1.0
 

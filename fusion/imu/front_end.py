@@ -299,6 +299,7 @@ class FrontEnd:
         update = count % f.intervals_per_update == 0
         due = count % round(f.output_rate * HEIGHT_SECONDS) == 0
         height = self._pressures.at(table[-1, 0]) if due else None
+        self.counts.pressure_silence = self._pressures.silence
         field_B = self._fields.at(table[-1, 0])
         attitudes = self._attitude.advance(table[:, 0], table[:, 1:4], table[:, 4:])
         self._windows.add(table, attitudes, flags)

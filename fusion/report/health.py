@@ -34,8 +34,9 @@ _RESTING = 100
 NIS_RATIO = 2.0
 """Factor between mean NIS and expectation, in either direction, above which to report it."""
 
-_LATE_S, _FIELDS_DROPPED = 0.5, 50
-"""Late samples in a row [s], and dropped magnetic fields, beyond which to tell of them."""
+_LATE_S, _FIELDS_DROPPED, _SILENT_S = 0.5, 50, 10.0
+"""Late samples in a row [s], dropped magnetic fields, and time without a pressure [s], beyond which
+to tell of them: a floor's stairs take ten seconds."""
 
 TURNED_RAD = math.radians(45.0)
 """Turn of the network's direction, beyond three sigmas, that is reported [rad]: half of a quarter
@@ -221,6 +222,17 @@ def _corrections(health: Health) -> Iterator[Finding]:
 
 
 def _floors(health: Health) -> Iterator[Finding]:
+    start, seconds = health.pressure_silence
+    if seconds > _SILENT_S:
+        text = (
+            f"The barometer told nothing for {seconds:.0f} s from {start:.0f} s on: there is no "
+            "pressure, or the same one again and again."
+        )
+        advice = (
+            "The height there is the network's, which knows no stairs: keep the logger in the "
+            "foreground, or give fixes with heights."
+        )
+        yield _found("pressure_silent", text, advice, {"start_s": start, "seconds": seconds})
     if health.floors:
         ways = "; ".join(map(str, health.floors))
         floors = [change._asdict() for change in health.floors]
@@ -243,6 +255,15 @@ def _field(health: Health) -> Iterator[Finding]:
     elif offered - health.bearings.get("applied", 0) > 0.5 * offered:
         text = f"The magnetic field was of little use ({_counted(health.bearings)})."
         yield _found("field_useless", text, values=health.bearings)
+    if apart := health.north_contradiction:
+        degrees = math.degrees(apart)
+        text = f"Magnetic north and the fixes' directions contradict each other by {degrees:.0f} "
+        text += "degrees; the track keeps to the fixes."
+        advice = (
+            "Check both: a declination is positive to the east, a yaw is measured in the map from "
+            "the x axis (east) towards the y axis (north)."
+        )
+        yield _found("north_contradicts", text, advice, {"degrees": degrees})
     if health.fields_dropped > _FIELDS_DROPPED:
         text = (
             f"{health.fields_dropped} magnetic fields were dropped: the sensor repeated its last "

@@ -34,7 +34,10 @@ class Health:
         pressures: numbers of heights by the pressure applied (of these gated), of steps of the
             air's pressure, and of refused ones by reason.
         floors: changes of floor found in the heights of a recording with a barometer.
-        pressures_dropped: number of pressures dropped: their value or time is wrong.
+        pressures_dropped: number of pressures dropped: their value or time is wrong, or a sensor
+            that has stopped repeats the last one.
+        pressure_silence: start and length of the longest time without a usable pressure from a
+            barometer that there is [s].
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
             from the innovations.
         network_error_level: final variance of the network's errors that change within seconds, as a
@@ -47,6 +50,8 @@ class Health:
         stopped: number of samples dropped because one sensor alone had stopped, by sensor.
         network_turn: yaw from the network's direction to the accelerometer's [rad], of a recording.
         network_turn_sigma: its standard deviation [rad]; pi if it is unknown.
+        north_contradiction: angle from magnetic north, by the declination given, to the north of a
+            track that fixes or a prior have oriented [rad]; 0 within three sigma.
         notes: further remarks, one line each, such as a graph that fell back to the filter.
     """
 
@@ -68,6 +73,7 @@ class Health:
     pressures: dict[str, int] = field(default_factory=dict)
     floors: list[FloorChange] = field(default_factory=list)
     pressures_dropped: int = 0
+    pressure_silence: tuple[float, float] = (0.0, 0.0)
     accel_noise_factor: float = 1.0
     network_error_level: float = 1.0
     final_sigma: dict[str, float] = field(default_factory=dict)
@@ -76,6 +82,7 @@ class Health:
     stopped: dict[str, int] = field(default_factory=dict)
     network_turn: float = 0.0
     network_turn_sigma: float = math.pi
+    north_contradiction: float = 0.0
     notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:

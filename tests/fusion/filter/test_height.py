@@ -15,6 +15,7 @@ from stario.fusion.evaluation.scores import values
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.height import with_height, yielding
 from stario.fusion.imu.barometer import HeightSample
+from stario.fusion.report.health import health_findings
 from stario.fusion.report.panels import motion_panels
 from stario.fusion.report.series import track_series
 from stario.sequences import Barometer, ImuSequence, InputError
@@ -137,6 +138,26 @@ def test_heights_follow_stairs_and_a_lift(house, house_track):
     error -= house.sequence.truth.at(house_track.time).position_W[:, 2] - true[0]
     variance = house_track.covariance[:, 8, 8]
     assert 0.05 < np.mean((error - error[0]) ** 2 / variance) < 3.0
+
+
+def test_without_pressures_on_a_climb_its_height_is_as_uncertain_as_it_is(house, level_oracle):
+    barometer = house.sequence.barometer
+    first, *_, last = Navigator(level_oracle, CONFIG).run(house.sequence).health.floors
+    heard = (barometer.time < first.start - 2.0) | (barometer.time > last.stop + 4.0)
+    silent = Barometer(barometer.time[heard], barometer.pressure_hPa[heard])
+    track = Navigator(level_oracle, CONFIG).run(replace(house.sequence, barometer=silent))
+    truth = house.sequence.truth.at(track.time).position_W[:, 2]
+    error = track.trajectory.position_W[:, 2] - truth
+    error -= error[0]
+    sigma = np.sqrt(track.covariance[:, 8, 8])
+    assert np.abs(error).max() > 2.0
+    assert np.all(np.abs(error) < 3.5 * sigma + 0.3)
+    assert abs(error[-1]) < 1.0
+    start, _ = track.health.pressure_silence
+    assert start == pytest.approx(
+        barometer.time[heard][np.diff(heard.nonzero()[0]).argmax()], abs=1
+    )
+    assert "pressure_silent" in [found.code for found in health_findings(track.health)]
 
 
 def test_floors_are_those_of_the_house(house, house_track):

@@ -11,7 +11,7 @@ from support import GRAPH as CONFIG
 from support import nav_state, stream, stream_deviation
 from told import health_lines
 
-from stario.fusion import Navigator, PriorPose, position_fix
+from stario.fusion import Navigator, PriorPose, position_fix, yaw_fix
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import (
@@ -23,6 +23,7 @@ from stario.fusion.filter.magnetic import (
     update_bearing,
     with_field,
 )
+from stario.fusion.report.health import health_findings
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import ImuSequence, Magnetometer
@@ -275,6 +276,20 @@ def test_the_field_tells_no_unknown_yaw_after_a_gap(biased_walk, make_oracle, wi
     fix = position_fix(5.0, walk.truth.at(np.array([5.0])).position_W[0], np.eye(3))
     track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=[fix])
     assert np.sqrt(track.covariance[track.time > 6.0, 2, 2]).min() > 1.5
+
+
+def test_a_north_that_contradicts_a_yaw_fix_is_told(biased_walk, make_oracle):
+    declination = math.pi / 2.0 - math.atan2(FIELD_W[1], FIELD_W[0])
+    walk = biased_walk.slice(0.0, 20.0)
+    oracle = make_oracle(walk, biased_walk.truth, CONFIG, noise=0.05, sigma=0.05)
+    yaw = float(yaw_of(walk.truth.at(np.array([1.5])).attitude_WB)[0])
+    for wrong in (0.0, -2.5):
+        settings = replace(CONFIG, filter=replace(CONFIG.filter, declination=declination + wrong))
+        fix = yaw_fix(1.5, yaw, 0.05)
+        health = Navigator(oracle, settings, backend="ekf").run(walk, fixes=[fix]).health
+        assert health.north_contradiction == pytest.approx(wrong, abs=0.4)
+        told = "north_contradicts" in [found.code for found in health_findings(health)]
+        assert told == bool(wrong)
 
 
 def test_north_is_not_applied_if_the_direction_is_known(biased_walk, make_oracle):

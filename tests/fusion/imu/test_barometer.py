@@ -81,6 +81,7 @@ def test_a_puff_of_air_is_held_back_and_nothing_else():
 
 def test_late_repeated_and_impossible_pressures_are_refused():
     buffer = HeightBuffer()
+    assert buffer.add(0.9, 1000.01, 1.0)
     assert buffer.add(1.0, 1000.0, 1.0)
     assert not buffer.add(1.0, 1000.0, 1.0)
     assert not buffer.add(0.5, 1000.0, 1.0)
@@ -92,9 +93,10 @@ def test_late_repeated_and_impossible_pressures_are_refused():
 
 
 def test_one_pressure_a_second_is_enough_and_none_is_none():
-    buffer, found = HeightBuffer(), []
+    buffer, found, rng = HeightBuffer(), [], np.random.default_rng(0)
     for k in range(30):
-        buffer.add(float(k), float(standard_pressure(np.array(0.3 * max(0, k - 15)))), float(k))
+        height = 0.3 * max(0, k - 15) + 0.01 * rng.standard_normal()
+        buffer.add(float(k), float(standard_pressure(np.array(height))), float(k))
         found += [buffer.at(k + 0.1), buffer.at(k + 0.6)]
     assert found[::2].count(None) < 4
     assert all(each is None for each in found[1::2])
@@ -111,3 +113,33 @@ def test_what_rises_faster_than_any_lift_is_no_height():
     assert len(used) > 30
     assert max(used) < 1.0
     assert found[-1].height == pytest.approx(60.0, abs=1.0)
+
+
+def test_a_sensor_that_has_stopped_tells_nothing():
+    rng = np.random.default_rng(0)
+    noisy = standard_pressure(0.05 * rng.standard_normal(400))
+    stuck = np.where(np.arange(400) < 160, noisy, noisy[160])
+    for pressures, start, height_count in ((stuck, 20.0, 48), (np.full(400, 1000.0), 0.0, 0)):
+        buffer, found = HeightBuffer(), []
+        for k, pressure in enumerate(pressures):
+            buffer.add(k / RATE, float(pressure), k / RATE)
+            if k % 4 == 3:
+                found.append(buffer.at(k / RATE))
+        known = [each for each in found if each is not None]
+        assert len(known) <= height_count
+        assert sum(buffer.silence) == pytest.approx(50.0, abs=0.2)
+        assert start <= buffer.silence[0] < start + 4.0
+
+
+def test_a_coarse_sensor_knows_heights_to_its_resolution():
+    """A tenth of a hectopascal is 0.84 m; that it repeats does not mean that it has stopped."""
+    buffer, found = HeightBuffer(), []
+    for k, height in enumerate(ramp(0.25)):
+        pressure = round(float(standard_pressure(np.array(300.3 + height))), 1)
+        # Before the first change it could be any sensor that has stopped.
+        assert buffer.add(k / RATE, pressure, k / RATE) or k < 12.0 * RATE
+        if k % 4 == 3:
+            found.append(buffer.at(k / RATE))
+    last = [each for each in found if each is not None][-1]
+    assert 0.84 / np.sqrt(12.0) < last.sigma < 0.84
+    assert all(each is None or each.stepped == 0.0 for each in found)
