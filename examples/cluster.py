@@ -9,6 +9,7 @@ read the recordings' paths. Needs `pip install '.[cluster]'`.
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -51,6 +52,7 @@ def main(folder: Path, seconds: float = 20.0) -> tuple[pd.DataFrame, list[Skippe
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description="Evaluate four recordings on two workers.").parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         scores, skipped, workers = main(Path(temporary))
     print(summary_table(scores))

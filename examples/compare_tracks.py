@@ -5,6 +5,8 @@ python examples/compare_tracks.py
 
 from __future__ import annotations
 
+import argparse
+
 from stario.fusion import Comparison, compare
 from stario.network import load_model
 from stario.sequences import PHONE_IMU, WalkStyle, generate_walk, simulate_imu
@@ -19,6 +21,7 @@ def main(seconds: float = 60.0) -> Comparison:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description="Compare tracks of a simulated walk.").parse_args()
     comparison = main()
     for name, metrics in comparison.metrics.items():
         print(f"{name:<24} horizontal ATE {metrics['ate_m']:.2f} m")

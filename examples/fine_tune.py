@@ -10,6 +10,7 @@ passed a known point (or had a satellite fix) and blank elsewhere, and run
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -52,5 +53,6 @@ def main(folder: Path, epochs: int = 1) -> DisplacementModel:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description="Fine-tune on three simulated walks.").parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         print(main(Path(temporary)).card.figures)

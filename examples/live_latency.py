@@ -114,7 +114,7 @@ def _memory_mb(pid: int) -> float:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Measure the latency of the live server.")
-    parser.add_argument("--phones", type=int, default=4)
+    parser.add_argument("--phones", type=int, default=4, choices=range(1, 51))
     parser.add_argument("--seconds", type=float, default=10.0, help="length of the walk [s]")
     options = parser.parse_args()
     found = main(options.phones, options.seconds)

@@ -1,11 +1,11 @@
 """Replay a recording against the live server, as a phone with Sensor Logger would send it.
 
-Without --url it starts a server, replays half a minute at five times the true speed, and prints
-where the track ended. `stario live --demo` shows a simulated walk. To watch a recording of your
-own, start the server first, open its page, and replay at true speed:
+Without --url it starts a server, replays at most half a minute at five times the true speed, and
+prints where the track ended. `stario live --demo` shows a simulated walk. To watch a recording of
+your own, start the server first, open its page, and replay at true speed:
 
     stario live
-    python examples/replay_live.py --url http://127.0.0.1:8000/data [RECORDING]
+    python examples/replay_live.py [RECORDING] --url http://127.0.0.1:8000/data
 """
 
 from __future__ import annotations
@@ -78,8 +78,10 @@ def replay(
     return accepted
 
 
-def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], Path]:
-    """Start a server and replay the bundled demonstration against it.
+def main(
+    recording: ImuSequence, speed: float = 5.0, seconds: float = 30.0
+) -> tuple[int, list[float], Path]:
+    """Start a server and replay a recording against it.
 
     Returns:
         Number of samples accepted, final x, y, z [m] as drawn, and path of the recording written.
@@ -93,7 +95,7 @@ def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], P
     listening.wait()
     try:
         url = f"http://127.0.0.1:{server.port}/data"
-        accepted = replay(demonstration(), url, speed, seconds)
+        accepted = replay(recording, url, speed, seconds)
         session = server.hub.sessions["replay"]
         return accepted, session.track.drawn.points[-1][1:4], session.track.path
     finally:
@@ -105,14 +107,12 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Replay a recording against the live server.")
     parser.add_argument("recording", nargs="?", type=Path, help="default: the demonstration")
     parser.add_argument("--url", help="address of a running server; default: start one")
-    parser.add_argument("--speed", type=float, default=1.0, help="multiple of the true speed")
+    parser.add_argument("--speed", type=float, default=1.0, help="with --url: times the true speed")
     parser.add_argument("--device", default="replay", help="name of the phone")
     options = parser.parse_args()
+    walk = read_recording(options.recording) if options.recording else demonstration()
     if options.url is None:
-        taken, end, path = main()
+        taken, end, path = main(walk)
         print(f"{taken} samples, end at {end} m; recording: {path}")
     else:
-        recording = demonstration()
-        if options.recording is not None:
-            recording = read_recording(options.recording)
-        print(replay(recording, options.url, options.speed, float("inf"), options.device))
+        print(replay(walk, options.url, options.speed, float("inf"), options.device))

@@ -23,7 +23,7 @@ runs on a bag (`pip install '.[bags]'`) or, with no argument, on the bundled dem
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -283,10 +283,14 @@ def spin() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--node"]:
+    parser = argparse.ArgumentParser(description="Odometry of a bag, or as a ROS 2 node.")
+    parser.add_argument("bag", nargs="?", type=Path, help="default: the demonstration")
+    parser.add_argument("--node", action="store_true", help="run as a node until it is shut down")
+    options = parser.parse_args()
+    if options.node:
         spin()
     else:
-        outputs = main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+        outputs = main(options.bag)
         for found in outputs[::20]:
             sigma = np.sqrt(np.diag(found.pose_covariance)[:3])
             seconds = (found.stamp_ns - outputs[0].stamp_ns) / 1e9

@@ -5,7 +5,7 @@ python examples/run_recording.py [RECORDING]
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -30,7 +30,9 @@ def main(path: Path | None = None) -> Track:
 
 
 if __name__ == "__main__":
-    track = main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    parser = argparse.ArgumentParser(description="Compute a fused track of a recording.")
+    parser.add_argument("recording", nargs="?", type=Path, help="default: a simulated one")
+    track = main(parser.parse_args().recording)
     end = track.trajectory.position_W[-1]
     sigma = track.trajectory.position_covariance_W[-1].diagonal() ** 0.5
     seconds = track.time[-1] - track.time[0]

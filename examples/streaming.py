@@ -5,6 +5,8 @@ python examples/streaming.py
 
 from __future__ import annotations
 
+import argparse
+
 from stario.fusion import Navigator, NavState, demonstration
 from stario.network import load_model
 
@@ -24,6 +26,7 @@ def main(seconds: float = 30.0) -> list[NavState]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description="Push the demonstration's samples one by one.").parse_args()
     for state in main()[::50]:
         sigma = state.position_covariance.diagonal() ** 0.5
         print(f"t {state.time:6.2f} s  p_W {state.p_W.round(2)} m  sigma {sigma.round(2)} m")

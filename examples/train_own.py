@@ -8,6 +8,7 @@ bar. This one is small enough to watch.
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -25,6 +26,7 @@ def main(folder: Path, epochs: int = 2) -> DisplacementModel:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description="Train on six simulated recordings.").parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         model = main(Path(temporary))
     print(model.card.figures)

@@ -136,14 +136,19 @@ class Trajectory(Timed):
         """
         return self.select((self.time >= start) & (self.time <= stop))
 
-    def path_length(self) -> float:
-        """Return the length of the path [m] along 1 s chords, so that sensor noise adds nothing."""
+    def path_length(self, horizontal: bool = True) -> float:
+        """Return the length of the path [m] along 1 s chords, so that sensor noise adds nothing.
+
+        Args:
+            horizontal: whether over ground, in x and y only.
+        """
         known = np.flatnonzero(self.valid)
         if len(known) < 2:
             return 0.0
         t = self.time[known]
         ticks = np.append(whole_seconds(t), t[-1])
-        chords = np.diff(interpolated(ticks, t, self.position_W[known]), axis=0)
+        axes = slice(2 if horizontal else 3)
+        chords = np.diff(interpolated(ticks, t, self.position_W[known, axes]), axis=0)
         return float(np.linalg.norm(chords, axis=1).sum())
 
 

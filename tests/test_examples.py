@@ -101,7 +101,7 @@ def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(pro
 
 
 def test_replay_live_ends_where_a_run_on_the_saved_recording_ends():
-    sample_count, end, path = load("replay_live").main(speed=20.0, seconds=6.0)
+    sample_count, end, path = load("replay_live").main(demonstration(), speed=20.0, seconds=6.0)
     recording = read_recording(path)
     assert sample_count == len(recording) == 1200
     track = Navigator(load_model("default"), backend="ekf").run(recording)

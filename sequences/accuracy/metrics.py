@@ -177,8 +177,7 @@ def evaluate_track(
     errors = pose_errors(align(estimate, truth, alignment), truth)
     time = errors.estimate.time
     error = errors.position_W[:, : 2 if horizontal else 3]
-    level = replace(errors.truth, position_W=errors.truth.position_W * [1.0, 1.0, 0.0])
-    path = (level if horizontal else errors.truth).path_length()
+    path = errors.truth.path_length(horizontal)
     rte, scaled = _relative_error(time, error, rte_interval, convention)
     return TrackMetrics(
         ate_m=_average(error, convention),
