@@ -198,7 +198,7 @@ def assemble_recording(
     gyro = read_samples(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel, converted, maybe_apple = _force(files, attitude, core_motion)
-    stamps, rate, force = resample_to_gyro(folder, gyro, accel)
+    stamps, rate, force, alone = resample_to_gyro(folder, gyro, accel)
     converted["gyro"] = gyro.unit not in ("", "rad/s")
     recording = alongside.Recording(files.gyro, files.key, stamps[0], stamps[-1])
     reported = alongside.reported_positions(recording)
@@ -215,6 +215,7 @@ def assemble_recording(
         satellites=first,
         source="" if core_motion else app_of(files) + gyro.assumed,
         maybe_apple=maybe_apple,
+        alone_s=alone,
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
@@ -241,7 +242,7 @@ def _force(
     accel = first or read_samples(files.tables["linear"][0], "linear")
     in_two_parts = total is None and gravity is not None
     if total is None and gravity is not None:
-        stamps, force, gravity_B = resample_to_gyro(
+        stamps, force, gravity_B, _ = resample_to_gyro(
             files.gyro.parent, accel, gravity, ("linear acceleration", "gravity")
         )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
