@@ -17,7 +17,7 @@ from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import Column, IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence
-from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
+from stario.sequences.time_order import MAX_IMU_GAP, disorder, hour_advice, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
@@ -153,7 +153,8 @@ def _sorted_samples(path: Path, name: str, samples: Samples, other_rate: float) 
         stamps_ns, values = stamps_ns[kept], values[kept]
         _log.warning(
             "%s: %s: dropped %d of %d samples whose times go back or jump ahead, by up to %.3g s: "
-            "split the recording there", path, name, (~kept).sum(), len(kept), set_back,
+            "%s", path, name, (~kept).sum(), len(kept), set_back,
+            hour_advice(set_back) or "split the recording there",
         )  # fmt: skip
     order = np.argsort(stamps_ns, kind="stable")
     stamps_ns, values = stamps_ns[order], values[order]
