@@ -109,7 +109,6 @@ def resample_to_gyro(
             for name, time in zip(names, (gyro.seconds(origin), accel.seconds(origin)), strict=True)
         ]
         raise ReadError(path, "time", ", ".join(spans), "overlapping times on one clock")
-    common = int(kept.sum())
     right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
     before, after = accel_ns[right - 1], accel_ns[right]
     exact = (gyro_ns == before) | (gyro_ns == after)
@@ -118,10 +117,10 @@ def resample_to_gyro(
         step = float(np.median(np.diff(accel_ns))) * 1e-9
         found, fix = f"samples {step:.3g} s apart", "is its unit the one that the header names?"
         raise ReadError(path, "time", found, f"at most {MAX_TRUTH_GAP} s", fix)
-    if (lost := common - int(kept.sum())) > _FEW_LOST * common:
+    if (lost := int((~kept).sum())) > _FEW_LOST * len(kept):
         _log.warning(
             "%s: dropped %d of %d samples at whose times only one of two sensors was recorded",
-            path, lost, common,
+            path, lost, len(kept),
         )  # fmt: skip
     time = seconds(gyro_ns[kept], accel_ns[0])
     force = interpolated(time, accel.seconds(accel_ns[0]), accel.values)
