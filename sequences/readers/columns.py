@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -223,6 +223,17 @@ def unit_factor(path: Path, column: Column, known: Mapping[str, float]) -> float
         names = ", ".join(filter(None, known)) or "no unit"
         raise ReadError(path, f"header, {column.title}", f"unit {column.unit!r}", names)
     return known[unit]
+
+
+def unit_of_axes(
+    path: Path, axes: Sequence[Column], known: Mapping[str, float]
+) -> tuple[str, float]:
+    """Return the unit that any of a sensor's axes names, which holds for all, and its factor."""
+    named = [column for column in axes if column.unit] or axes[:1]
+    if len({unit_factor(path, column, known) for column in named}) > 1:
+        found = ", ".join(f"{column.title} in {column.unit}" for column in named)
+        raise ReadError(path, "header", found, "one unit for all axes of a sensor")
+    return named[0].unit, unit_factor(path, named[0], known)
 
 
 def _names_columns(line: str) -> bool:

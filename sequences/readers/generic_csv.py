@@ -53,8 +53,8 @@ separate rows: neither sensor at rest reads exactly 0, 0, 0."""
 def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
     rows = _read_rows(path)
-    gyro, gyro_factors = rows.vectors("g", GYRO_UNITS)
-    accel, accel_factors = rows.vectors("a", ACCEL_UNITS)
+    gyro, gyro_factor = rows.vectors("g", GYRO_UNITS)
+    accel, accel_factor = rows.vectors("a", ACCEL_UNITS)
     rows, time, gyro, accel, alone = _samples(rows, gyro, accel)
     truth, positions = _ground_truth(rows)
     field = rows.vectors("m", MAGNETIC_UNITS)[0] if "mx" in rows.values else None
@@ -63,9 +63,9 @@ def read_generic_csv(path: Path) -> ImuSequence:
         values = rows.values[columns.PRESSURE]
         barometer = checked.barometer(path, place.title, rows.time, values, place.unit)
     converted = {
-        "gyro": gyro_factors != 1.0,
-        "accel": np.abs(accel_factors) != 1.0,
-        "sign": accel_factors < 0.0,
+        "gyro": gyro_factor != 1.0,
+        "accel": abs(accel_factor) != 1.0,
+        "sign": accel_factor < 0.0,
     }
     return ImuSequence(
         name=path.stem,
@@ -78,7 +78,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
         barometer=barometer,
         satellites=_satellites(rows),
         source=f"generic CSV{rows.assumed}",
-        converted=frozenset(sensor for sensor, done in converted.items() if done.any()),
+        converted=frozenset(sensor for sensor, done in converted.items() if done),
         alone_s=alone,
     )
 
@@ -100,13 +100,11 @@ class _Rows:
     line_numbers: text.IntArray
     assumed: str
 
-    def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
-        """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
+    def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, float]:
+        """Return three columns (N, 3) in the first unit of `known`, and the factor to it."""
         names = [letter + axis for axis in "xyz"]
-        factors = np.array(
-            [columns.unit_factor(self.path, self.columns[name], known) for name in names]
-        )
-        return np.stack([self.values[name] for name in names], axis=1) * factors, factors
+        factor = columns.unit_of_axes(self.path, [self.columns[name] for name in names], known)[1]
+        return np.stack([self.values[name] for name in names], axis=1) * factor, factor
 
 
 def _read_rows(path: Path) -> _Rows:

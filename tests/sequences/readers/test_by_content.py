@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from csv_lines import write_lines
 
-from stario.sequences import read_recording, write_csv
+from stario.sequences import ReadError, read_recording, write_csv
 
 CLOCKS = {
     **{"t [s]": 1, "time_s": 1, "seconds_elapsed": 1, "timestamp [ms]": 1e3},
@@ -47,3 +47,20 @@ def test_any_title_of_a_clock_gives_the_same_recording(clock, placed, walk, tmp_
     np.testing.assert_allclose(read.time, walk.time, atol=1e-9)
     assert (read.truth is not None) == placed
     assert (read.device_attitude is not None) != placed
+
+
+@pytest.mark.parametrize("names", ["gx gy gz ax ay az", "gyro_x gyro_y gyro_z acc_x acc_y acc_z"])
+@pytest.mark.parametrize("units", [["deg/s", "rad/s", "rad/s"], ["", "rad/s", "deg/s"]])
+def test_a_sensor_has_one_unit_whichever_of_its_axes_names_it(names, units, walk, tmp_path):
+    def read(units):
+        titles = [
+            f"{name} [{unit}]".replace(" []", "")
+            for name, unit in zip(names.split(), units, strict=True)
+        ]
+        cells = np.column_stack([walk.time, np.degrees(walk.gyro), walk.accel])
+        rows = [",".join(map(str, row)) for row in cells.tolist()]
+        return read_recording(write_lines(tmp_path / "w.csv", ",".join(["t [s]", *titles]), *rows))
+
+    with pytest.raises(ReadError, match="expected one unit for all axes"):
+        read([*units, "m/s^2", "m/s^2", "m/s^2"])
+    np.testing.assert_allclose(read(["", "deg/s", "", "", "", "m/s^2"]).gyro, walk.gyro, atol=1e-9)
