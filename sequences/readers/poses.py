@@ -77,10 +77,7 @@ class _Poses:
 
 
 def pose_files(folder: Path, key: str = "") -> list[Path]:
-    """Return a recording's pose files by name; `key` holds the words that its names share.
-
-    A table of both sensors is a recording, whatever its name.
-    """
+    """Return pose files by name, but no table of both sensors; `key` holds words that all share."""
     found = []
     for file in sorted(folder.iterdir()):
         words = set(words_of(file.stem))
