@@ -35,10 +35,14 @@ class Georeference:
 
     def __post_init__(self) -> None:
         expected = "latitude and longitude in degrees, as in 48.137 and 11.575"
-        bounds = {"latitude_deg": 90.0, "longitude_deg": 360.0, "yaw": 100.0}
-        for name, bound in bounds.items():
+        bounds = {
+            "latitude_deg": (-90.0, 90.0),
+            "longitude_deg": (-180.0, 360.0),
+            "yaw": (-1e2, 1e2),
+        }
+        for name, (low, high) in bounds.items():
             value = getattr(self, name)
-            if not abs(value) <= bound:
+            if not low <= value <= high:
                 wanted = "an angle in radians" if name == "yaw" else expected
                 raise InputError(f"georeference: {name}", f"{value:g}", wanted)
 

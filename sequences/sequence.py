@@ -177,6 +177,8 @@ class ImuSequence:
         axes: the axes x, y, z of all sensors in those of the file, see `with_axes`.
         maybe_apple: whether the accelerometer may have Apple's sign, which nothing in the file
             tells: `check_units` warns of it.
+        alone_s: seconds for which a sensor of the file was recorded before the other began or after
+            it ended, by its name, if that is a notable part; such samples are left out.
 
     Raises:
         InputError: the arrays' shapes do not agree, there is no sample, time, gyro or accel holds
@@ -198,6 +200,7 @@ class ImuSequence:
     source: str = ""
     axes: str = "x,y,z"
     maybe_apple: bool = False
+    alone_s: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_type("name", self.name, str, 'such as ImuSequence("walk", time, gyro, accel)')

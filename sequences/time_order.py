@@ -82,3 +82,9 @@ def disorder(time: FloatArray) -> str:
     back = int((np.diff(time[np.isfinite(time)]) < 0.0).sum())
     many = back > _OUT_OF_ORDER * len(time)
     return f"{back} of {len(time)} times earlier than the one above" if many else ""
+
+
+def hour_advice(step: float) -> str:
+    """Return what to do about a step [s] of an hour to a sample or two, empty for any other."""
+    whole = abs(abs(step) - 3600.0) < MAX_IMU_GAP
+    return "by an hour, as local time does for daylight saving: export UTC" if whole else ""

@@ -100,7 +100,8 @@ def magnetic_advice(size: float) -> str:
     """Return what to do about a field of a size that is the earth's in another unit than uT."""
     fits = (u for u in MAGNETIC_UNITS if _EARTH_UT[0] < size * MAGNETIC_UNITS[u] < _EARTH_UT[1])
     unit = next(fits, "uT")
-    return "" if unit == "uT" else f"if in {unit}, give {MAGNETIC_UNITS[unit]:g} * field"
+    iron = "; if in uT, most of it is the device's own (hard iron)" if unit == "mg" else ""
+    return "" if unit == "uT" else f"if in {unit}, give {MAGNETIC_UNITS[unit]:g} * field{iron}"
 
 
 _SPELLINGS = {

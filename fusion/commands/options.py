@@ -239,8 +239,9 @@ class Map:
         str | None,
         _place(
             metavar="LAT,LON[,YAW]",
-            help="Latitude and longitude of the start, or of the fixes' zero, in degrees, and "
-            "perhaps the direction of the track's x axis, counter-clockwise from east.",
+            help="Latitude and longitude (-180 to 180, or 0 to 360 eastwards) of the start, or of "
+            "the fixes' zero, in degrees, and perhaps the direction of the track's x axis, "
+            "counter-clockwise from east.",
         ),
     ] = None
 

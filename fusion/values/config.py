@@ -35,8 +35,8 @@ MIN_OUTPUT_RATE = 10
 SATELLITES = ("use", "compare", "ignore")
 """What may become of a recording's satellite positions."""
 
-_ORIGIN = (90.0, 360.0, 360.0)
-"""Largest latitude, longitude and yaw of an origin [deg]."""
+_ORIGIN = ((-90.0, 90.0), (-180.0, 360.0), (-360.0, 360.0))
+"""Ranges of latitude, longitude and yaw of an origin [deg]; some count longitudes to 360."""
 
 
 def _check_flag(settings: object, name: str) -> None:
@@ -189,8 +189,12 @@ class PlaceConfig:
 def _checked_origin(origin: object) -> tuple[float, ...]:
     values = tuple(origin) if isinstance(origin, tuple | list) else ()
     numbers = len(values) in (2, 3) and all(isinstance(v, Real) for v in values)
-    if not (numbers and all(abs(v) <= most for v, most in zip(values, _ORIGIN, strict=False))):
-        expected = "latitude and longitude in degrees, as in 48.137,11.575, and perhaps a yaw"
+    pairs = zip(values, _ORIGIN, strict=False)
+    if not (numbers and all(low <= v <= high for v, (low, high) in pairs)):
+        expected = (
+            "latitude and longitude (-180 to 180, or 0 to 360 eastwards) in degrees, as in "
+            "48.137,11.575, and perhaps a yaw"
+        )
         raise ConfigError("origin", repr(origin), expected)
     return tuple(float(v) for v in values)
 

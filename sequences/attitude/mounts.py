@@ -162,7 +162,8 @@ def pieces_between_jumps(both: Rotations, valid: BoolArray) -> list[Piece]:
 def _remounted(both: Rotations, known: NDArray[np.intp], gap: int) -> bool:
     """Return whether the mounts fitted to up to 10 s before and after a gap contradict."""
     longest = samples_in(MIN_FIT_S, both.time)
-    breaks = np.concatenate([[-1], np.flatnonzero(np.diff(known) > 1), [len(known) - 1]])
+    ends = (np.diff(known) > 1) | (np.diff(both.time[known]) > _GAP_S)  # or the capture has no rows
+    breaks = np.concatenate([[-1], np.flatnonzero(ends), [len(known) - 1]])
     k = int(np.searchsorted(breaks, gap))
     sides = (
         known[max(breaks[k - 1] + 1, gap - longest) : gap + 1],

@@ -98,8 +98,8 @@ def check_units(sequence: ImuSequence) -> None:
 def unit_findings(sequence: ImuSequence) -> list[Finding]:
     """Check a recording's units, and return what nothing in the file tells.
 
-    These are a gyroscope that turns about the vertical only, fast enough for deg/s, and an
-    accelerometer that may have Apple's sign.
+    These are a gyroscope that turns about the vertical only, fast enough for deg/s, an
+    accelerometer that may have Apple's sign, and a sensor that went on without the other.
 
     Raises:
         InputError: it is too short or holds no number, time is in another unit, a sensor is dead,
@@ -130,6 +130,13 @@ def unit_findings(sequence: ImuSequence) -> list[Finding]:
         )
         fix = "if it is from an iPhone, pass `--accel-sign apple`"
         found.append(Finding("apple_sign_open", text, fix, level="note"))
+    if sequence.alone_s:
+        times = " and ".join(
+            f"only the {name} for {s:.1f} s" for name, s in sequence.alone_s.items()
+        )
+        text = f"samples: found {times}, which are left out"
+        fix = "was a file cut short, or did the app start or stop one of them alone?"
+        found.append(Finding("sensor_alone", text, fix, values=sequence.alone_s))
     if not sequence.source:  # a reader would have told the sign, or asked
         found += downward(accel)
     return found

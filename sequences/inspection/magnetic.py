@@ -132,7 +132,10 @@ def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
         "recording_s": float(len(seconds)),
     }
     figures["verdict"] = _verdict(figures)
-    return Assessment(figures, _lines(figures), _findings(figures, certain))
+    earth = (
+        median if certain is None else float(np.median(np.linalg.norm(values - certain, axis=1)))
+    )
+    return Assessment(figures, _lines(figures), _findings(figures, certain, earth))
 
 
 def _verdict(figures: Mapping[str, Any]) -> str:
@@ -182,9 +185,9 @@ def _lines(figures: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _findings(figures: Mapping[str, Any], iron: FloatArray | None) -> list[Finding]:
-    result = []
-    agreement, size = figures["correlation_with_gyroscope"], figures["size_median_uT"]
+def _findings(figures: Mapping[str, Any], iron: FloatArray | None, size: float) -> list[Finding]:
+    """Return what stands out; hard iron, if certain, is not part of the field's `size` [uT]."""
+    result, agreement = list[Finding](), figures["correlation_with_gyroscope"]
     if not _SIZES_UT[0] < size < _SIZES_UT[1]:
         text = f"magnetometer: found {size:.3g} uT, expected the earth's 25 to 65"
         fix = magnetic_advice(size) or "is it uncalibrated, in another unit or near a magnet?"

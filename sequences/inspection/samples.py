@@ -17,7 +17,7 @@ from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES, usa
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding
 from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray, ImuSequence
-from stario.sequences.time_order import ahead_mask, disorder, increasing_mask
+from stario.sequences.time_order import ahead_mask, disorder, hour_advice, increasing_mask
 from stario.sequences.units import TIME_UNITS
 
 _SET_BACK = 5.0
@@ -90,17 +90,23 @@ def sample_findings(sequence: ImuSequence) -> list[Finding]:
 
 
 def _late(sequence: ImuSequence) -> list[Finding]:
-    """Report the longest run of late samples, as the health of a run does."""
+    """Report the longest run of late samples, as the health of a run does, or else a lost hour."""
     time = sequence.time[np.isfinite(sequence.time)]
-    if disorder(time):
+    if not len(time) or disorder(time):
         return []
     newest = np.maximum.accumulate(time)
     late = [(float(time[b - 1] - time[a]), a) for a, b in runs(time < newest)]
     seconds, first = max(late, default=(0.0, 0))
     if seconds < _LATE_SECONDS:
-        return []
+        steps = np.diff(time, append=time[-1])
+        first = int(np.argmax(steps))
+        by, at = float(steps[first]), float(time[first] - time[0])
+        text = f"time: the clock jumps ahead by {by:.4g} s at {at:.1f} s"
+        values = {"by_s": by, "at_s": at}
+        advice = hour_advice(by)  # of the code by which a run tells of gaps: told once
+        return [Finding("gaps", text, advice, values=values)] if advice else []
     by, at = float(newest[first] - time[first]), float(time[first - 1] - time[0])
-    code, text = "clock_set_back", f"time: the clock jumps back by {by:.3g} s at {at:.1f} s"
+    code, text = "clock_set_back", f"time: the clock jumps back by {by:.4g} s at {at:.1f} s"
     if by <= _SET_BACK:
         code = "samples_late"
         text = (
@@ -108,7 +114,7 @@ def _late(sequence: ImuSequence) -> list[Finding]:
             f"or from a clock that was set back by {by:.3g} s; if so, that time is missing"
         )
     values = {"by_s": by, "at_s": at, "longest_s": seconds}
-    return [Finding(code, text, "split the recording there", values=values)]
+    return [Finding(code, text, hour_advice(by) or "split the recording there", values=values)]
 
 
 def limit_words(sensor: str, values: FloatArray, unit: str, large: float) -> str:

@@ -6,11 +6,13 @@ be called from outside, and those that raise anything else, say so. Recognising 
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from filecmp import cmp
 from pathlib import Path
 
 from stario.sequences.arrays import check_choice, short_repr
@@ -84,6 +86,8 @@ def _unpacked(unpack: Callable[..., None], source: str = "") -> Callable[..., Im
 
     return read
 
+
+_log = logging.getLogger(__name__)
 
 _EVENTS = "logger with one line per event"
 _LONG = "logger with the sensor named in each row"
@@ -190,7 +194,19 @@ def find_recordings(
     found = [path] if path.is_file() else sorted(_below(path))
     if not found:
         raise unrecognised(path, [])
+    _warn_of_copies(found)
     return _with_attributes(found, where)
+
+
+def _warn_of_copies(found: list[Path]) -> None:
+    """Say which files are copies, `walk (1).csv`: counted twice, a recording weighs twice."""
+    by_size: dict[int, list[Path]] = {}
+    for path in filter(Path.is_file, found):
+        alike = by_size.setdefault(path.stat().st_size, [])
+        if original := next((one for one in alike if cmp(one, path, shallow=False)), None):
+            _log.warning("%s: the same recording as %s: remove one", path, original)
+        else:
+            alike.append(path)
 
 
 def _readable(path: str | Path, expected: str) -> Path:

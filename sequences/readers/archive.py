@@ -119,10 +119,15 @@ def is_archive(path: Path) -> bool:
         return False
     try:
         with opened_hdf5(path, _EXPECTED) as file:
-            groups = (group for group in file.values() if hasattr(group, "keys"))
+            groups = _groups(file).values()
             return any("imu/t" in group or "truth/t" in group for group in groups)
     except ReadError:
         return path.name != _RONIN
+
+
+def _groups(file: Any) -> dict[str, Any]:
+    """Return a file's groups by name, without datasets beside them."""
+    return {name: group for name, group in file.items() if hasattr(group, "keys")}
 
 
 def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Path]:
@@ -141,7 +146,7 @@ def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Pa
     with opened_hdf5(path, _EXPECTED) as file:
         known = {
             name: {**(_attributes(group) if wanted else {}), "name": name}
-            for name, group in file.items()
+            for name, group in _groups(file).items()
             if "imu/t" in group
         }
     chosen = [name for name, attributes in known.items() if _matches(attributes, wanted)]
@@ -201,13 +206,15 @@ def read_archive(path: Path) -> ImuSequence:
     """
     file_path, name = split_name(path)
     with opened_hdf5(file_path, _EXPECTED) as file:
-        names = list(file)
+        names = list(_groups(file))
+        if not names:
+            raise ReadError(file_path, "recordings", "no group", "one for each, with its imu/t")
         if name is None and len(names) == 1:
             name = names[0]
         if name is None:
             found, fix = f"{len(names)} recordings", f"use {path.name}:{names[0]}"
             raise ReadError(file_path, "recording", found, "the name of one", fix)
-        if name not in file:
+        if not hasattr(file.get(name), "keys"):
             known = ", ".join(names[:3])
             raise ReadError(file_path, "recording", repr(name), f"a name in it, such as {known}")
         try:

@@ -73,10 +73,11 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     imu = messages.pop(_IMU)
     gyro = Samples(imu.stamps_ns, imu.values[:, _GYRO])
     stamps, rate, force = gyro.stamps_ns, gyro.values, imu.values[:, _ACCEL]
+    parts = dict[str, Any]()
     if (apart := messages.pop(_APART, None)) is not None:
         accel = Samples(apart.stamps_ns, apart.values[:, _ACCEL])
-        stamps, rate, force = resample_to_gyro(path, gyro, accel)
-    start_ns, parts = stamps[0], dict[str, Any]()
+        stamps, rate, force, parts["alone_s"] = resample_to_gyro(path, gyro, accel)
+    start_ns = stamps[0]
     for kind, others in messages.items():
         time, values, topic = others.seconds(start_ns), others.values, others.topic
         if kind == _MAGNETIC:

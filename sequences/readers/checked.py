@@ -187,19 +187,19 @@ def _in_hPa(path: Path, title: str, values: FloatArray, unit: str) -> FloatArray
     value = float(np.median(values))
     if unit and unit not in PRESSURE_UNITS:
         raise ReadError(path, title, f"{value:.6g} {unit}", *_PRESSURE)
-    likely = unit
-    if not (unit and LOWEST_HPA <= PRESSURE_UNITS[unit] * value <= HIGHEST_HPA):
-        if not (likely := pressure_unit_of(value)):
-            raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_PRESSURE)
-        if unit:
-            words = "%s: %s: %.6g is no pressure in %s: read as %s"
-            _log.warning(words, path, title, value, unit, likely)
+    plausible = bool(unit) and LOWEST_HPA <= PRESSURE_UNITS[unit] * value <= HIGHEST_HPA
+    likely = unit if plausible else pressure_unit_of(value)
+    if not likely:
+        raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_PRESSURE)
     pressure_hPa = values * PRESSURE_UNITS[likely]
     steps = np.abs(np.diff(pressure_hPa))
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    if not unit and step > _LARGEST_STEP_HPA:
+    if likely != unit and step > _LARGEST_STEP_HPA:  # in the title's unit they may be rounded
         found = f"steps of {step:.2g} hPa, which is {8.4 * step:.0f} m of height"
         raise ReadError(path, title, found, *_PRESSURE)
+    if unit and likely != unit:
+        words = "%s: %s: %.6g is no pressure in %s: read as %s"
+        _log.warning(words, path, title, value, unit, likely)
     return np.asarray(pressure_hPa)
 
 

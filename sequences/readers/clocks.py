@@ -17,7 +17,7 @@ from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import Column, IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence
-from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
+from stario.sequences.time_order import MAX_IMU_GAP, disorder, hour_advice, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
@@ -47,8 +47,9 @@ _LATEST_S = 4.1e9
 _SINCE_1970_S = 1e8
 """Times beyond this [s] are counted from 1970 rather than from a start."""
 
-_FEW_LOST = 0.05
-"""Share of samples before the start or after the end of another sensor that need no mention."""
+_FEW_LOST, _SHORT_S = 0.05, 1.0
+"""Share of samples without those of another sensor, and time [s] of those before its start and
+after its end, that need no mention."""
 
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
@@ -79,11 +80,11 @@ def joined_sequence(
     path: Path, name: str, gyro: Samples, accel: Samples, mag: Samples | None = None
 ) -> tuple[ImuSequence, np.int64]:
     """Return a recording of sensors sampled apart, and its first sample's time [ns]."""
-    stamps, rate, force = resample_to_gyro(path, gyro, accel)
+    stamps, rate, force, alone = resample_to_gyro(path, gyro, accel)
     start_ns = stamps[0]
     field = None if mag is None else magnetometer(mag.seconds(start_ns), mag.values)
     time = seconds(stamps, start_ns)
-    return ImuSequence(name, time, rate, force, magnetometer=field), start_ns
+    return ImuSequence(name, time, rate, force, magnetometer=field, alone_s=alone), start_ns
 
 
 def resample_to_gyro(
@@ -91,11 +92,12 @@ def resample_to_gyro(
     gyro: Samples,
     accel: Samples,
     names: tuple[str, str] = ("gyroscope", "accelerometer"),
-) -> tuple[IntArray, FloatArray, FloatArray]:
+) -> tuple[IntArray, FloatArray, FloatArray, dict[str, float]]:
     """Return times [ns], gyroscope and accelerometer, interpolated to it in their common time span.
 
-    Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
-    unknown. Both clocks have one origin; `names` are for messages if they are other sensors'.
+    `ImuSequence.alone_s` follows. Samples in an accelerometer gap of more than 0.1 s are skipped,
+    since the force there is unknown. Both clocks have one origin; `names` are for messages if they
+    are other sensors'.
     """
     accel = _sorted_samples(path, names[1], accel, _rate(gyro.stamps_ns))
     gyro_ns, accel_ns = gyro.stamps_ns, accel.stamps_ns
@@ -122,7 +124,18 @@ def resample_to_gyro(
         )  # fmt: skip
     time = seconds(gyro_ns[kept], accel_ns[0])
     force = interpolated(time, accel.seconds(accel_ns[0]), accel.values)
-    return gyro_ns[kept], gyro.values[kept], force
+    alone = {names[0]: _alone_s(gyro_ns, accel_ns), names[1]: _alone_s(accel_ns, gyro_ns)}
+    return gyro_ns[kept], gyro.values[kept], force, {name: s for name, s in alone.items() if s}
+
+
+def _alone_s(stamps_ns: IntArray, other_ns: IntArray) -> float:
+    """Return the time [s] of samples before another sensor's start and after its end, 0 for few.
+
+    They are counted, so that a single wild time is not taken for years.
+    """
+    outside = (stamps_ns < other_ns.min()) | (stamps_ns > other_ns.max())
+    alone_s = len(np.unique(stamps_ns[outside])) / _rate(stamps_ns)
+    return alone_s if alone_s > _SHORT_S and outside.mean() > _FEW_LOST else 0.0
 
 
 def _sorted_samples(path: Path, name: str, samples: Samples, other_rate: float) -> Samples:
@@ -139,7 +152,8 @@ def _sorted_samples(path: Path, name: str, samples: Samples, other_rate: float) 
         stamps_ns, values = stamps_ns[kept], values[kept]
         _log.warning(
             "%s: %s: dropped %d of %d samples whose times go back or jump ahead, by up to %.3g s: "
-            "split the recording there", path, name, (~kept).sum(), len(kept), set_back,
+            "%s", path, name, (~kept).sum(), len(kept), set_back,
+            hour_advice(set_back) or "split the recording there",
         )  # fmt: skip
     order = np.argsort(stamps_ns, kind="stable")
     stamps_ns, values = stamps_ns[order], values[order]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from stario.sequences.readers.phones.sensor_words import (
     is_time,
     is_uncalibrated,
     sensor_of,
+    time_unit_of,
 )
 from stario.sequences.readers.text import Column, first_lines
 from stario.sequences.units import (
@@ -164,7 +165,7 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     ignored = []
     for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
         title, unit = _cell(text)
-        unit = unit_named(unit)
+        unit = unit_named(unit) or (time_unit_of(title) if name == "t" else "")
         if not name or (name in RARE and name in columns):
             ignored.append(title)
         elif name in RARE and unit not in RARE_UNITS[name]:
@@ -224,6 +225,17 @@ def unit_factor(path: Path, column: Column, known: Mapping[str, float]) -> float
     return known[unit]
 
 
+def unit_of_axes(
+    path: Path, axes: Sequence[Column], known: Mapping[str, float]
+) -> tuple[str, float]:
+    """Return the unit that any of a sensor's axes names, which holds for all, and its factor."""
+    named = [column for column in axes if column.unit] or axes[:1]
+    if len({unit_factor(path, column, known) for column in named}) > 1:
+        found = ", ".join(f"{column.title} in {column.unit}" for column in named)
+        raise ReadError(path, "header", found, "one unit for all axes of a sensor")
+    return named[0].unit, unit_factor(path, named[0], known)
+
+
 def _names_columns(line: str) -> bool:
     """Return whether a line names any IMU column of this format."""
     return bool(set(canonical_names(line)) & set(IMU))
@@ -232,8 +244,14 @@ def _names_columns(line: str) -> bool:
 def _names(titles: list[str]) -> list[str]:
     """Return the canonical name of each title, empty for one of no interest."""
     plain = [_cell(text)[0] for text in titles]
-    temperature = sum(map(is_time, plain)) > 1  # what `T` is next to a clock, as in ArduPilot's
-    return ["" if title == "T" and temperature else _name(title.lower()) for title in plain]
+    clocks = [k for k, title in enumerate(plain) if is_time(title)]
+    if len(clocks) > 1:  # `T` next to a clock is a temperature, as in ArduPilot's
+        plain = ["" if title == "T" else title for title in plain]
+        clocks = [k for k in clocks if plain[k]]
+    names = [_name(title.lower()) for title in plain]
+    if clocks and "t" not in names:  # `time_ms`, `seconds_elapsed`
+        names[clocks[0]] = "t"
+    return names
 
 
 def _name(title: str) -> str:

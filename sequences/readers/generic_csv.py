@@ -53,9 +53,9 @@ separate rows: neither sensor at rest reads exactly 0, 0, 0."""
 def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
     rows = _read_rows(path)
-    gyro, gyro_factors = rows.vectors("g", GYRO_UNITS)
-    accel, accel_factors = rows.vectors("a", ACCEL_UNITS)
-    rows, time, gyro, accel = _samples(rows, gyro, accel)
+    gyro, gyro_factor = rows.vectors("g", GYRO_UNITS)
+    accel, accel_factor = rows.vectors("a", ACCEL_UNITS)
+    rows, time, gyro, accel, alone = _samples(rows, gyro, accel)
     truth, positions = _ground_truth(rows)
     field = rows.vectors("m", MAGNETIC_UNITS)[0] if "mx" in rows.values else None
     barometer = None
@@ -63,9 +63,9 @@ def read_generic_csv(path: Path) -> ImuSequence:
         values = rows.values[columns.PRESSURE]
         barometer = checked.barometer(path, place.title, rows.time, values, place.unit)
     converted = {
-        "gyro": gyro_factors != 1.0,
-        "accel": np.abs(accel_factors) != 1.0,
-        "sign": accel_factors < 0.0,
+        "gyro": gyro_factor != 1.0,
+        "accel": abs(accel_factor) != 1.0,
+        "sign": accel_factor < 0.0,
     }
     return ImuSequence(
         name=path.stem,
@@ -78,7 +78,8 @@ def read_generic_csv(path: Path) -> ImuSequence:
         barometer=barometer,
         satellites=_satellites(rows),
         source=f"generic CSV{rows.assumed}",
-        converted=frozenset(sensor for sensor, done in converted.items() if done.any()),
+        converted=frozenset(sensor for sensor, done in converted.items() if done),
+        alone_s=alone,
     )
 
 
@@ -99,13 +100,11 @@ class _Rows:
     line_numbers: text.IntArray
     assumed: str
 
-    def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
-        """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
+    def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, float]:
+        """Return three columns (N, 3) in the first unit of `known`, and the factor to it."""
         names = [letter + axis for axis in "xyz"]
-        factors = np.array(
-            [columns.unit_factor(self.path, self.columns[name], known) for name in names]
-        )
-        return np.stack([self.values[name] for name in names], axis=1) * factors, factors
+        factor = columns.unit_of_axes(self.path, [self.columns[name] for name in names], known)[1]
+        return np.stack([self.values[name] for name in names], axis=1) * factor, factor
 
 
 def _read_rows(path: Path) -> _Rows:
@@ -186,8 +185,8 @@ def _imu_rows(table: text.Table, imu: list[int]) -> BoolArray:
 
 def _samples(
     rows: _Rows, gyro: FloatArray, accel: FloatArray
-) -> tuple[_Rows, FloatArray, FloatArray, FloatArray]:
-    """Return the rows, and times (N,), gyroscope and accelerometer (N, 3) of the IMU samples.
+) -> tuple[_Rows, FloatArray, FloatArray, FloatArray, dict[str, float]]:
+    """Return rows, times (N,), gyroscope, accelerometer (N, 3), `ImuSequence.alone_s`.
 
     If the sensors are mostly in different rows, the accelerometer is interpolated to those of the
     gyroscope, and the time of all rows starts at the first one at which both are known.
@@ -200,12 +199,12 @@ def _samples(
     if apart and shared.any():  # a sensor that fails for a while stays NaN, to be counted
         apart = np.diff(shared).mean() > _ALTERNATING
     if of_accel.sum() < 2 or not apart:
-        return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
+        return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu], {}
     ns = np.rint(np.where(known, rows.time, 0.0) * 1e9).astype(np.int64)
     rates, forces = Samples(ns[of_gyro], gyro[of_gyro]), Samples(ns[of_accel], accel[of_accel])
-    stamps, rate, force = resample_to_gyro(rows.path, rates, forces)
+    stamps, rate, force, alone = resample_to_gyro(rows.path, rates, forces)
     rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
-    return rows, text.seconds(stamps, stamps[0]), rate, force
+    return rows, text.seconds(stamps, stamps[0]), rate, force, alone
 
 
 def _without_zeros(

@@ -26,6 +26,7 @@ from stario.sequences.clean_samples import clean_samples
 from stario.sequences.conventions import axes_named
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
+from stario.sequences.readers.phones.files import names_both_sensors
 from stario.sequences.readers.phones.sensor_words import words_of
 from stario.sequences.readers.table_head import table_heads
 from stario.sequences.readers.text import IntArray, seconds
@@ -76,14 +77,14 @@ class _Poses:
 
 
 def pose_files(folder: Path, key: str = "") -> list[Path]:
-    """Return a recording's pose files by name; `key` holds the words that its names share."""
+    """Return pose files by name, but no table of both sensors; `key` holds words that all share."""
     found = []
     for file in sorted(folder.iterdir()):
         words = set(words_of(file.stem))
         named = any(name in "".join(words_of(file.stem)) for name in _NAMES)
         if file.suffix.lower() not in _SUFFIXES or not named or _OTHER & words:
             continue
-        if set(key.split()) <= words:
+        if set(key.split()) <= words and not names_both_sensors(file):
             found.append(file)
     return found
 

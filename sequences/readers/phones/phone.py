@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import Samples, resample_to_gyro
-from stario.sequences.readers.columns import IMU, POSITION, named_columns
+from stario.sequences.readers.columns import IMU, POSITION, QUAT, named_columns
 from stario.sequences.readers.phones import alongside
 from stario.sequences.readers.phones.attitude import (
     accel_sign,
@@ -97,8 +97,8 @@ def read_wide(path: Path) -> ImuSequence:
 def is_wide(path: Path) -> bool:
     """Return whether a file's header names a clock and the axes of both sensors.
 
-    A generic CSV counts only if poses lie next to it, or if it has two kinds of force (gFx and ax,
-    or gravity apart) and no ground truth.
+    A generic CSV counts only if it holds no ground truth, and poses lie next to it or it has what
+    that format lacks: two kinds of force (gFx and ax, or gravity apart) or the device's attitude.
     """
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         return False
@@ -106,12 +106,14 @@ def is_wide(path: Path) -> bool:
     if files is None:
         return False
     named = named_columns(path)
+    if named >= {"t", *IMU} and named & set(POSITION):
+        return False
     if not named >= {"t", *IMU} or _wide_poses(path, files):
         return True
     axes = files.tables["gyro"][0].axes
     in_two_parts = bool({"linear", "gravity"} & set(axes))
     in_two_parts |= "accel" in axes and axes["accel"][0].title.lower().startswith("g")
-    return in_two_parts and not named & set(POSITION)
+    return in_two_parts or named >= set(QUAT)
 
 
 def _wide(path: Path) -> PhoneFiles | None:
@@ -196,7 +198,7 @@ def assemble_recording(
     gyro = read_samples(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel, converted, maybe_apple = _force(files, attitude, core_motion)
-    stamps, rate, force = resample_to_gyro(folder, gyro, accel)
+    stamps, rate, force, alone = resample_to_gyro(folder, gyro, accel)
     converted["gyro"] = gyro.unit not in ("", "rad/s")
     recording = alongside.Recording(files.gyro, files.key, stamps[0], stamps[-1])
     reported = alongside.reported_positions(recording)
@@ -213,6 +215,7 @@ def assemble_recording(
         satellites=first,
         source="" if core_motion else app_of(files) + gyro.assumed,
         maybe_apple=maybe_apple,
+        alone_s=alone,
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
@@ -239,7 +242,7 @@ def _force(
     accel = first or read_samples(files.tables["linear"][0], "linear")
     in_two_parts = total is None and gravity is not None
     if total is None and gravity is not None:
-        stamps, force, gravity_B = resample_to_gyro(
+        stamps, force, gravity_B, _ = resample_to_gyro(
             files.gyro.parent, accel, gravity, ("linear acceleration", "gravity")
         )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)

@@ -19,7 +19,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import Samples, clock_unit
-from stario.sequences.readers.columns import unit_factor
+from stario.sequences.readers.columns import unit_of_axes
 from stario.sequences.readers.phones.sensor_words import (
     SENSORS,
     Sensor,
@@ -323,12 +323,12 @@ def read_samples(table: SensorTable, sensor: Sensor) -> Samples:
     time, values = rows.values[kept, 0], rows.values[kept, 1:4]
     if table.biases:
         values = values - rows.values[kept, 4:7]
-    named = next((place for place in places if place.unit), places[0])
-    values = unit_factor(table.file, named, SENSORS[sensor].units) * values
+    unit, factor = unit_of_axes(table.file, places, SENSORS[sensor].units)
+    values = factor * values
     sound = _sound_samples(table.file, sensor, titles, values)
     kept, time, values = kept[sound], time[sound], values[sound]
     unit_ns, assumed = clock_unit(table.file, clock, time)
-    return Samples(rows.stamps_ns(unit_ns, kept), values, named.unit, assumed)
+    return Samples(rows.stamps_ns(unit_ns, kept), values, unit, assumed)
 
 
 def _complete_rows(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> IntArray:

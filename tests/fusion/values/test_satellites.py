@@ -166,7 +166,9 @@ def test_metres_beside_degrees_need_an_origin(walk, model):
 WRONG = {"satellites": "always", "waypoints": "ignore", "origin": (48.1,), "closed": "yes"}
 
 
-@pytest.mark.parametrize(("name", "value"), [*WRONG.items(), ("origin", (11.5, 948.1))])
+@pytest.mark.parametrize(
+    ("name", "value"), [*WRONG.items(), ("origin", (11.5, 948.1)), ("origin", (0.0, -181.0))]
+)
 def test_an_unknown_use_or_place_is_refused(name, value):
     with pytest.raises(ConfigError, match=name):
         PlaceConfig(**{name: value})

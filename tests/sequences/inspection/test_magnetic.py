@@ -50,6 +50,20 @@ def test_correlation_lag_hard_iron_dip_and_drift_are_recovered():
     assert "hard iron" in str(found.findings[0])
 
 
+@pytest.mark.parametrize("iron", [IRON, (197.0, 165.0, -591.0)], ids=["small", "of ADVIO's phone"])
+@pytest.mark.parametrize("per_uT", [1.0, 10.0], ids=["uT", "mg"])
+def test_hard_iron_is_not_taken_for_another_unit(iron, per_uT):
+    sequence = walk(MagneticField(hard_iron=iron))
+    field = sequence.magnetometer
+    found = assess_magnetometer(
+        replace(sequence, magnetometer=Magnetometer(field.time, per_uT * field.field))
+    ).findings
+    wrong_unit = [str(one) for one in found if one.code == "field_size"]
+    assert len(wrong_unit) == (per_uT != 1.0)
+    assert all("if in mg, give 0.1 * field" in text for text in wrong_unit)
+    assert any(one.code == "hard_iron" for one in found)
+
+
 def test_a_short_recording_gives_no_verdict_and_its_span_is_named():
     whole = walk(MagneticField())
     for end, verdict, words in (

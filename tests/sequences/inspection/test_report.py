@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -44,6 +45,21 @@ def test_jumps_of_satellite_positions_are_a_problem(walk):
     path[10:15] += [0.0, 100.0]
     assert "positions: found jumps of up to 100 m" in problem(outdoors)
     assert told(taps) == []  # no source of positions jumps there
+
+
+@pytest.mark.parametrize(
+    ("by", "words"),
+    [
+        (3600.0, ["jumps ahead by 3600 s at 15.0 s: by an hour, .*daylight saving: export UTC"]),
+        (-3600.0, ["jumps back by 3600 s at 15.0 s: by an hour, .*daylight saving: export UTC"]),
+        (3603.0, []),
+        (-3603.0, ["jumps back by 3603 s at 15.0 s: split the recording there"]),
+    ],
+)
+def test_a_clock_that_changes_for_daylight_saving_is_named(walk, by, words):
+    changed = replace(walk, truth=None, time=walk.time + np.where(walk.time > 15.0, by, 0.0))
+    for found, expected in zip(told(changed), words, strict=True):
+        assert re.search(expected, found)
 
 
 @pytest.mark.parametrize("part", ["magnetometer", "barometer", "satellites", "positions"])

@@ -115,6 +115,15 @@ def test_other_groups_and_attributes_are_passed_over(tmp_path):
         read_recording(f"{path}:b")
 
 
+@pytest.mark.parametrize("datasets", [[], ["data"], ["a", "b"]])
+def test_a_file_without_recordings_says_so(tmp_path, datasets):
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file.update({name: np.zeros((5, 7)) for name in datasets})
+    for name in ("other.h5", "other.h5:a"):
+        with pytest.raises(ReadError, match="recordings: found no group, expected one for each"):
+            read_recording(tmp_path / name, format="archive")
+
+
 @pytest.mark.skipif(not ARCHIVES.is_dir(), reason="the development recordings are not here")
 def test_mean_specific_force_points_up_in_the_true_frame_of_the_archives():
     for name in ("tyrex.h5:Thibaud_Nexus5_NoDist_Texting", "ridi.h5:dan_bag1", "kipd.h5:07CL"):

@@ -52,3 +52,14 @@ def test_recordings_named_by_letters_are_not_the_sensors_of_one(stem, tmp_path):
     found = [read_recording(path) for path in find_recordings(tmp_path)]
     assert [round(one.duration) for one in found] == [10, 11, 12, 13]
     assert all(one.source == "generic CSV" and one.magnetometer is None for one in found)
+
+
+def test_a_copy_of_a_recording_is_named(walk, tmp_path, caplog):
+    for name in ("walk", "walk (1)"):
+        write_csv(tmp_path / f"{name}.csv", walk)
+    write_csv(tmp_path / "other.csv", walk.select(slice(1, None)))
+    assert len(find_recordings(tmp_path)) == 3
+    [told] = [record.getMessage() for record in caplog.records]
+    assert told == (
+        f"{tmp_path / 'walk.csv'}: the same recording as {tmp_path / 'walk (1).csv'}: remove one"
+    )

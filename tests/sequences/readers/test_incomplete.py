@@ -7,8 +7,15 @@ import published_formats as formats
 import pytest
 from phone_exports import save
 
-from stario.sequences import ReadError, find_recordings, read_recording
+from stario.sequences import (
+    ReadError,
+    check_units,
+    find_recordings,
+    inspect_recording,
+    read_recording,
+)
 from stario.sequences.datasets.convert import write_euroc
+from stario.sequences.readers.columns import HEADER
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +92,40 @@ def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position
     with pytest.raises(ReadError, match=r"header: .*, expected time, gyroscope xyz and acc"):
         read_recording(tmp_path / "V1")
     np.testing.assert_allclose(read_recording(imu, format="csv").gyro, walk.gyro)
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "alone"),
+    [
+        (slice(0, 190), slice(None), {"accelerometer": 1.1}),
+        (slice(None), slice(0, 190), {"gyroscope": 1.1}),
+        (slice(0, 190), slice(20, 300), {"accelerometer": 1.1}),
+        (slice(0, 250), slice(None), {}),
+    ],
+    ids=["gyroscope cut", "accelerometer cut", "starts late", "half a second"],
+)
+@pytest.mark.parametrize("form", ["folder", "csv"])
+def test_a_sensor_that_goes_on_without_the_other_is_told(
+    form, gyro, accel, alone, walk, tmp_path, caplog
+):
+    if form == "folder":
+        save(tmp_path / "w/Gyroscope.csv", "time [s],x,y,z", walk.time[gyro], walk.gyro[gyro])
+        save(
+            tmp_path / "w/Accelerometer.csv", "time [s],x,y,z", walk.time[accel], walk.accel[accel]
+        )
+    else:
+        rows = [
+            (t + 0.001, f"{t + 0.001:.4f},,,,{x},{y},{z}")
+            for t, (x, y, z) in zip(walk.time[accel], walk.accel[accel], strict=True)
+        ]
+        rows += [
+            (t, f"{t:.4f},{x},{y},{z},,,")
+            for t, (x, y, z) in zip(walk.time[gyro], walk.gyro[gyro], strict=True)
+        ]
+        (tmp_path / "w.csv").write_text("\n".join([HEADER, *(text for _, text in sorted(rows))]))
+    read = read_recording(tmp_path / ("w" if form == "folder" else "w.csv"))
+    assert read.alone_s == pytest.approx(alone, abs=0.03)
+    codes = [finding.code for finding in inspect_recording(read).findings]
+    assert ("sensor_alone" in codes) == bool(alone)
+    check_units(read)
+    assert ("which are left out" in caplog.text) == bool(alone)

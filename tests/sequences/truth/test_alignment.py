@@ -89,6 +89,18 @@ def test_the_lag_is_found_to_about_a_millisecond_even_with_little_rotation(late)
     assert aligned.correlation > 0.9
 
 
+def test_a_capture_that_wrote_no_rows_for_a_while_keeps_its_mount():
+    imu, truth = recorded("handheld", 60.0)
+    _, attitude_WV = captured(truth, 0.004)
+    kept = (truth.time < 25.0) | (truth.time > 27.0)
+    valid = np.ones(int(kept.sum()), dtype=np.bool_)
+    aligned = align_tracked_body(
+        imu.time, imu.gyro, imu.accel, truth.time[kept], attitude_WV[kept], valid
+    )
+    assert len(aligned.mounts) == 1
+    assert np.degrees((MOUNT_VB.inv() * aligned.mounts[0][2]).magnitude()) < 1.0
+
+
 @pytest.mark.parametrize("error_deg", [-6.0, 4.0])
 def test_a_turned_mount_is_detected_despite_lever_arm_and_bias_unless_data_are_too_few(error_deg):
     imu, truth = recorded("trolley")

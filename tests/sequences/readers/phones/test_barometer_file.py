@@ -86,6 +86,7 @@ def test_pressure_is_on_the_sensors_clock_and_read_once_where_every_row_repeats_
         ("height (m)", 520.0 + TIME, "found 526 m.*altitude"),
         ("value", 3.0 + TIME, "value: found 9,.*altitude"),
         ("value", 520.0 + TIME, "1 hPa, which is 8 m of height.*altitude"),
+        ("pressure (mbar)", 98.0 + TIME, "10 hPa, which is 84 m of height.*altitude"),
         ("pressure (hPa)", HPA, "from 7200 to 7212 s after the first sample"),
     ],
 )
