@@ -146,10 +146,11 @@ def consistency(
 ) -> None:
     """Run a Monte Carlo test on simulated walks: are NEES, NIS and yaw error consistent?"""
     from stario.fusion.evaluation.checks import consistency as check
+    from stario.fusion.evaluation.scores import joined
 
     settings, sigma = options.Estimator(config).settings(), max(math.radians(yaw), 1e-6)
-    with common.progress_bar("consistency") as progress:
-        scores = check.consistency(settings, sigma, runs, seconds, seed, progress)
+    seeds = common.with_bar("consistency", range(seed, seed + runs), runs)
+    scores = joined(check.consistency(settings, sigma, seconds, each) for each in seeds)
     found = check.summary(scores, seconds)
     common.print_result(as_json, found, check.consistency_text(found))
 
