@@ -125,14 +125,14 @@ class _Evaluation:
         str,
         typer.Option(
             help="With --data: test, validation, training, holdout, all, open, or a list file "
-            "with lines of name, group.",
+            "with lines of name, group."
         ),
     ] = "test"
     by: Annotated[
         options.Grouping | None,
         typer.Option(
             help="Evaluate the network alone by groups. Ground truth may be poses, positions or "
-            "waypoints.",
+            "waypoints."
         ),
     ] = None
     against: Annotated[
@@ -140,7 +140,7 @@ class _Evaluation:
         typer.Option(
             help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
             "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
-            "name stands for each recording's group, or its first word: leave-one-out.",
+            "name stands for each recording's group, or its first word: leave-one-out."
         ),
     ] = None
     filtered: Annotated[

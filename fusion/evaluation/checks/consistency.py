@@ -82,10 +82,7 @@ def consistency_text(found: dict[str, Any]) -> str:
 
 
 def consistency(
-    config: NavigatorConfig,
-    yaw_sigma: float = YAW_SIGMA,
-    seconds: float = 300.0,
-    seed: int = 0,
+    config: NavigatorConfig, yaw_sigma: float = YAW_SIGMA, seconds: float = 300.0, seed: int = 0
 ) -> pd.DataFrame:
     """Score the filter on a simulated walk with errors drawn from its configured deviations.
 

@@ -35,14 +35,7 @@ from stario.fusion.evaluation.checks.faults import (
 from stario.fusion.evaluation.compare import Metrics, measure, navigators
 from stario.fusion.evaluation.displacement_error import known_truth
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error, true_path
-from stario.fusion.evaluation.scores import (
-    Column,
-    by_track,
-    median_degrees,
-    parts,
-    scored,
-    table,
-)
+from stario.fusion.evaluation.scores import Column, by_track, median_degrees, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track, true_poses
 from stario.fusion.filter import estimator
 from stario.fusion.filter.record import innovations_of
@@ -87,10 +80,7 @@ _MIN_FIXES, _MIN_PATH = 4, 1.0
 
 
 def fusion_gain(
-    model: Predictor,
-    sequence: ImuSequence,
-    config: NavigatorConfig,
-    graph: bool = False,
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, graph: bool = False
 ) -> pd.DataFrame:
     """Score the network alone and the filter: `error_m`, its `ratio` to the network's, NIS.
 
@@ -117,9 +107,7 @@ def simulated_gain(seed: int, seconds: float, graph: bool = False) -> pd.DataFra
     estimators are given the exact standard deviations. Person and carry are drawn at random.
     """
     errors = ImuErrors(
-        noise=ImuNoise(),
-        gyro_turn_on=PHONE_IMU.gyro_turn_on,
-        accel_turn_on=PHONE_IMU.accel_turn_on,
+        noise=ImuNoise(), gyro_turn_on=PHONE_IMU.gyro_turn_on, accel_turn_on=PHONE_IMU.accel_turn_on
     )
     config = matched_config(errors)
     config = replace(config, filter=replace(config.filter, update_rate=1))

@@ -55,10 +55,7 @@ def speed(model: Predictor) -> pd.Series[float]:
             times[name] = (perf_counter() - began) / (sequence.duration / 60.0)
         rows.append(times)
     plain, with_update = _push_times(Navigator(model), sequence)
-    samples = {
-        "push_us": np.median(plain),
-        "push_with_update_us": np.percentile(with_update, 99),
-    }
+    samples = {"push_us": np.median(plain), "push_with_update_us": np.percentile(with_update, 99)}
     return pd.concat([pd.DataFrame(rows).median(), pd.Series(samples)])
 
 
