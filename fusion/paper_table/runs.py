@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation.compare import TRACK_TITLES
-from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS, FIGURES
+from stario.fusion.evaluation.displacement_error import FIGURES, blocks_of
 from stario.fusion.evaluation.groups import alone_on
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import (
@@ -314,9 +314,8 @@ def _recording(
 
 def _position_blocks(poses: PoseErrors) -> pd.DataFrame:
     since, squares = poses.estimate.time - poses.estimate.time[0], poses.position_W[:, :2] ** 2
-    errors = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS)
-    sums = errors.agg(squares="sum", count="count").reset_index(drop=True)
-    return sums.assign(block=sums.index, metric="ate")
+    errors = {"metric": "ate", "piece": 0, "second": since, "squares": squares.sum(axis=1)}
+    return blocks_of(pd.DataFrame(errors))
 
 
 def _protocol_errors(

@@ -1,15 +1,8 @@
 """The fusion on recordings, by group: beside its network, with fixes, samples missing, heights.
 
-- Benefit: errors of the filtered and the smoothed track, and of a stream's fixed-lag graph,
-  relative to the network's, whose displacements are chained along the attitude levelled from the
-  IMU. They are horizontal, root mean square after a fit of yaw and position: over all poses, or at
-  the waypoints. Simulated walks, measured with white noise of known size, show the estimators
-  alone.
-- Fixes: true positions at equal intervals with white errors; is the error as large as reported?
-  Only the second half of each track counts: by then several fixes have determined the direction.
-- Missing samples: a short gap at each of several instants, and samples dropped at random. Results
-  must not depend on a few samples. All tracks begin in the same pose, so ends need no alignment.
-- Heights and floors, with the barometer and without, at waypoints with floors or true poses.
+Errors are horizontal, root mean square after a fit of yaw and position: over all poses, or at the
+waypoints. With fixes only the second half of each track counts: by then several have determined the
+direction. Tracks with samples missing begin in the same pose, so ends need no alignment.
 """
 
 from __future__ import annotations
@@ -83,6 +76,8 @@ def fusion_gain(
     model: Predictor, sequence: ImuSequence, config: NavigatorConfig, graph: bool = False
 ) -> pd.DataFrame:
     """Score the network alone and the filter: `error_m`, its `ratio` to the network's, NIS.
+
+    The network's displacements are chained along the attitude levelled from the IMU.
 
     The error is also given in percent of the true path (of the legs between waypoints; not where
     positions are known whose noise adds up), and the processor time without the network
