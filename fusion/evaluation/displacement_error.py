@@ -121,10 +121,7 @@ def usable_streams(sequence: ImuSequence) -> list[LevelledStream]:
     """
     check_units(sequence)
     warn(sequence.name, dead_axes(sequence))
-    streams = levelled_streams(sequence)
-    if not streams:
-        raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
-    return streams
+    return levelled_streams(sequence)
 
 
 class _AtTicks(NamedTuple):
