@@ -79,21 +79,16 @@ def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
     by_name = logs.T.groupby(level="network", sort=False).mean()  # (N, 1 + R), first the whole
     places = by_name.rank(method="first").astype(int).to_numpy()
     low, high = np.percentile(places[:, 1:], _BOUNDS, axis=1, method="nearest")
-    base = by_name.loc[against] if against in by_name.index else None
-    ratios = [
-        None if base is None else _interval((errors - base).to_numpy(), len(runs))
-        for _, errors in by_name.iterrows()
-    ]
+    ratios: list[Interval | None] = [None] * len(by_name)
+    if against in by_name.index:
+        apart = (by_name - by_name.loc[against]).to_numpy()
+        bounds = np.full((2, len(apart)), np.nan)
+        if len(runs) >= _MIN_BLOCKS:
+            bounds = np.percentile(apart[:, 1:], _BOUNDS, axis=1)
+        found = np.exp(np.vstack([apart[:, 0], bounds])).T
+        ratios = [Interval(*each) for each in found.tolist()]
     columns = {"network": by_name.index, "rank": places[:, 0], "rank_low": low, "rank_high": high}
     return pd.DataFrame({**columns, "ratio": ratios})
-
-
-def _interval(differences: FloatArray, blocks: int) -> Interval:
-    """Return the ratio from differences (1 + R,) of mean log errors, those of all blocks first."""
-    bounds = [math.nan, math.nan]
-    if blocks >= _MIN_BLOCKS:
-        bounds = np.exp(np.percentile(differences[1:], _BOUNDS)).tolist()
-    return Interval(math.exp(differences[0]), *bounds)
 
 
 def _resampled(part: pd.DataFrame, units: Sequence[str], rng: np.random.Generator) -> FloatArray:

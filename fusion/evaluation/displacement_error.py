@@ -82,7 +82,6 @@ FIGURES = {
 }
 """Figures of a recording and their meaning; NaN if its kind of truth does not provide one."""
 
-
 _MIN_PATH_M = 1.0
 """Length of the true path [m] below which a recording is not compared."""
 
