@@ -132,19 +132,16 @@ class Run:
     def digest(self) -> str:
         """Digest of everything that its results depend on except the code."""
         test = [recording_state(entry.path) for entry in self.dataset.test]
-        if self.recipe is None:
-            learned = "" if self.network == PDR else _weights_sha256(self.network)
+        if self.recipe is not None:
+            parts = (self.dataset.training, self.dataset.validation)
+            states = [[*map(recording_state, part)] for part in parts]
+            learned = _digest([asdict(self.recipe), states])
         else:
-            learned = recipe_digest(self.recipe, self.dataset)
-        return hashlib.sha256(json.dumps([self.network, learned, test]).encode()).hexdigest()
+            learned = "" if self.network == PDR else _weights_sha256(self.network)
+        return _digest([self.network, learned, test])
 
 
-def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
-    """Return the digest of everything that a run's training depends on except the code."""
-    inputs = [
-        asdict(recipe),
-        [[*map(recording_state, part)] for part in (dataset.training, dataset.validation)],
-    ]
+def _digest(inputs: object) -> str:
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
