@@ -17,6 +17,7 @@ from stario.sequences.arrays import even_grid
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.stacks import slerp
 from stario.sequences.clean_samples import spike_free_samples, unbroken
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
     WINDOW_RATE,
@@ -87,7 +88,8 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
         min_seconds: minimum length of a stretch [s].
 
     Raises:
-        InputError: too few samples, or their rate is not between 50 Hz and 1 kHz.
+        InputError: too few samples, no stretch is long enough, or the rate is not between 50 Hz
+            and 1 kHz.
     """
     time, gyro, accel = spike_free_samples(sequence)
     streams = []
@@ -104,4 +106,7 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
         even = resample(time[part], values, grid).astype(np.float32)
         imu_N, facing_N = (np.ascontiguousarray(part) for part in np.split(even, [6], axis=1))
         streams.append(LevelledStream(float(time[begin]), imu_N, facing_N, at_ticks.as_matrix()))
+    if not streams:
+        found, expected = "no unbroken stretch", f"one of {min_seconds:g} s"
+        raise InputError(f"{sequence.name}: samples", found, expected)
     return streams

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -40,10 +40,21 @@ class _Check:
     estimating: options.Estimator
     as_json: options.Json = False
 
-    def recordings(self, score: Score, table: Table, by: str = "") -> None:
-        """Score each recording, as one of its group if they are grouped by a label; print all."""
+    def run(
+        self,
+        score: Score,
+        table: Table,
+        by: str = "",
+        walks: Sequence[Callable[[], ImuSequence]] = (),
+    ) -> None:
+        """Score each recording, or without PATH the simulated walks, and print all.
+
+        With a label, each is one of its group by it, and a walk one of "simulated".
+        """
         from stario.fusion.evaluation.groups import labels
 
+        if not self.paths:
+            self.refuse(*options.READING)
         model, settings = self.estimating.network(), self.estimating.settings()
 
         def of_named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
@@ -52,14 +63,10 @@ class _Check:
 
         files, skipped = self.reading.recordings(self.paths or [])
         found, failed = common.map_recordings("check", self.reading, files, of_named)
+        for walk in () if self.paths else common.with_bar("check", walks, len(walks)):
+            scores = score(model, walk(), settings)
+            found.append(scores.assign(group="simulated") if by else scores)
         self.show(found, skipped + failed, table)
-
-    def walks(self, score: Score, table: Table, walks: Sequence[Callable[[], ImuSequence]]) -> None:
-        """Score simulated walks, for which nothing is read, and print them."""
-        self.refuse(*options.READING)
-        model, settings = self.estimating.network(), self.estimating.settings()
-        made = common.with_bar("check", walks, len(walks))
-        self.show([score(model, walk(), settings) for walk in made], [], table)
 
     def refuse(self, *names: str) -> None:
         """Refuse options that do nothing with simulated walks."""
@@ -146,10 +153,11 @@ def consistency(
 ) -> None:
     """Run a Monte Carlo test on simulated walks: are NEES, NIS and yaw error consistent?"""
     from stario.fusion.evaluation.checks import consistency as check
+    from stario.fusion.evaluation.scores import joined
 
     settings, sigma = options.Estimator(config).settings(), max(math.radians(yaw), 1e-6)
-    with common.progress_bar("consistency") as progress:
-        scores = check.consistency(settings, sigma, runs, seconds, seed, progress)
+    seeds = common.with_bar("consistency", range(seed, seed + runs), runs)
+    scores = joined(check.consistency(settings, sigma, seconds, each) for each in seeds)
     found = check.summary(scores, seconds)
     common.print_result(as_json, found, check.consistency_text(found))
 
@@ -184,7 +192,7 @@ def fusion(
     if check.paths:
         unused = "walks", "seconds"
         options.refuse(check.context, "with recordings", "use with simulated walks", *unused)
-        check.recordings(partial(fusion_gain, graph=graph), fusion_gain_table, by)
+        check.run(partial(fusion_gain, graph=graph), fusion_gain_table, by)
         return
     check.refuse(*options.READING, *options.ESTIMATING, "by")
     seeds = common.with_bar("fusion", range(walks), walks)
@@ -204,7 +212,7 @@ def fixes(
     from stario.fusion.evaluation.checks.fusion import fixes_table, track_with_fixes
 
     score = partial(track_with_fixes, every=every, sigma=sigma, backend=backend)
-    check.recordings(score, fixes_table, by)
+    check.run(score, fixes_table, by)
 
 
 @options.expanded
@@ -220,17 +228,10 @@ def heights(
     from stario.fusion.evaluation.checks.fusion import heights_table, score_heights
     from stario.sequences.simulation.house import simulate_house
 
-    if check.paths:
-        check.recordings(score_heights, heights_table, by)
-        return
-
     def house(seed: int) -> ImuSequence:
         return simulate_house(seed, name=f"house-{seed}").sequence
 
-    def score(*given: Any) -> pd.DataFrame:
-        return score_heights(*given).assign(group="simulated")
-
-    check.walks(score, heights_table, [partial(house, k) for k in range(walks)])
+    check.run(score_heights, heights_table, by, [partial(house, k) for k in range(walks)])
 
 
 @options.expanded
@@ -238,7 +239,7 @@ def gaps(check: _CheckOfRecordings, by: options.By = "set") -> None:
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.fusion import end_shift_table, end_shifts
 
-    check.recordings(end_shifts, end_shift_table, by)
+    check.run(end_shifts, end_shift_table, by)
 
 
 @options.expanded
@@ -254,12 +255,8 @@ def moments(
     from stario.fusion.evaluation.checks.moments import CARRIES, moment_costs, moment_table
     from stario.fusion.evaluation.checks.simulation import simulated_walk
 
-    score = partial(moment_costs, graph=graph, seed=seed)
-    if check.paths:
-        check.recordings(score, moment_table)
-    else:
-        walks = [partial(simulated_walk, carry, k) for k, carry in enumerate(CARRIES)]
-        check.walks(score, moment_table, walks)
+    walks = [partial(simulated_walk, carry, k) for k, carry in enumerate(CARRIES)]
+    check.run(partial(moment_costs, graph=graph, seed=seed), moment_table, walks=walks)
 
 
 @options.expanded
@@ -330,10 +327,9 @@ def table(
 
     The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
+    from stario.fusion.paper_table.runs import ReaderConfig, complete_run, table_runs
     from stario.fusion.paper_table.runs import backend as on_backend
-    from stario.fusion.paper_table.runs import complete_run, table_runs
     from stario.fusion.paper_table.table import known_costs, write_results
-    from stario.fusion.paper_table.training import ReaderConfig
     from stario.network.architectures import ARCHITECTURES
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.stream_cache import cache_folder

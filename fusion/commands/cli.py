@@ -22,11 +22,7 @@ from stario.fusion.commands.train import export, train
 from stario.sequences.errors import StarioError
 from stario.sequences.findings import FINDINGS
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
 def _print_version(wanted: bool) -> None:

@@ -138,10 +138,8 @@ def list_skipped(skipped: Sequence[Skipped]) -> None:
     for failure in skipped:
         by_reason.setdefault(_bare_reason(failure), []).append(failure.item)
     for reason, items in by_reason.items():
-        named = items
-        if len(items) > _NAMED:
-            named = [f"{len(items)} recordings, the first {items[0]}"]
-        for words in named:
+        several = [f"{len(items)} recordings, the first {items[0]}"]
+        for words in items if len(items) <= _NAMED else several:
             where = "" if words in reason else f"{words}: "
             typer.echo(f"stario: skipped: {where}{reason}", err=True)
 

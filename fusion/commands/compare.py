@@ -5,10 +5,10 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from stario.fusion.evaluation.compare import Comparison
     from stario.fusion.evaluation.pedestrian import Model
-    from stario.sequences.datasets.splits import ListEntry
     from stario.sequences.sequence import ImuSequence
 
 _GROUP, _SET = "{group}", "{set}"
@@ -113,150 +112,136 @@ def _lines(found: Comparison, as_table: bool) -> list[str]:
     return [line, *table, *(finding.line() for finding in found.verdict)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Evaluation:
+    """What `evaluate` is given."""
+
+    context: typer.Context
+    reading: options.Reading
+    estimating: options.Estimator
+    paths: options.OptionalPaths = None
+    data: options.Data = None
+    split: Annotated[
+        str,
+        typer.Option(
+            help="With --data: test, validation, training, holdout, all, open, or a list file "
+            "with lines of name, group."
+        ),
+    ] = "test"
+    by: Annotated[
+        options.Grouping | None,
+        typer.Option(
+            help="Evaluate the network alone by groups. Ground truth may be poses, positions or "
+            "waypoints."
+        ),
+    ] = None
+    against: Annotated[
+        str | None,
+        typer.Option(
+            help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
+            "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
+            "name stands for each recording's group, or its first word: leave-one-out."
+        ),
+    ] = None
+    filtered: Annotated[
+        bool, options.flag("--filtered", help="With --by: also report the filter's mean NIS; slow.")
+    ] = False
+    jobs: options.Jobs = 1
+    out: options.EvaluateOut = None
+    as_json: options.Json = False
+
+    def refuse_unused(self) -> None:
+        """Refuse options that the chosen recordings and kind of evaluation do not use."""
+        refuse = partial(options.refuse, self.context)
+        if self.paths:
+            refuse("with PATH", "one of the two", "data")
+        if self.data is None:
+            refuse("without --data", "use with --data", "split")
+        else:
+            refuse("with --data", "use with PATH: name the archive", "where")
+        if self.by is None:
+            refuse("without --by", "a grouping, such as --by set", "against", "filtered")
+        else:
+            alone = "use without: the network alone is judged"
+            refuse("with --by", alone, "config", "magnetometer", "declination")
+
+    def recordings(self) -> tuple[dict[Path, str], list[Skipped]]:
+        """Return the recordings, of a list with their groups, and the skipped paths."""
+        from stario.network.training.splits import read_packaged_list
+
+        if self.paths:
+            files, skipped = self.reading.recordings(self.paths)
+            return dict.fromkeys(files, ""), skipped
+        if self.data is None:
+            raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
+        return {e.path: e.group for e in read_packaged_list(self.split, self.data)}, []
+
+    def tracks(self, files: list[Path]) -> list[Skipped]:
+        """Print the table of recordings, and write tracks one by one; return those skipped."""
+        from stario.fusion.evaluation.compare import compare_recordings
+        from stario.fusion.evaluation.results import write_recording, write_summary
+        from stario.fusion.evaluation.scores import joined
+        from stario.fusion.evaluation.text import summary, summary_table
+
+        settings, network = self.estimating.settings(), self.estimating.network()
+        model = network if self.jobs == 1 else self.estimating.model  # loaded once a process
+        origin = common.origin_of(files, self.reading, self.estimating, network)
+        read, jobs = self.reading.read, self.jobs
+        skipped: list[Skipped] = []
+        found = []
+        with common.progress_bar("evaluate", 100 * len(files)) as progress:
+            outcomes = compare_recordings(
+                files, model, settings, read, jobs, truth_needed=True, progress=progress
+            )
+            for comparison in without_skipped(outcomes, skipped):
+                if self.out is not None:
+                    write_recording(self.out, comparison)
+                found.append(comparison.scores)
+        if found:
+            scores = joined(found)
+            if self.out is not None:
+                write_summary(self.out, scores, settings, origin)
+            common.print_result(self.as_json, summary(scores), summary_table(scores))
+        return skipped
+
+    def groups(self, groups: Mapping[Path, str], by: str) -> list[Skipped]:
+        """Print and write the table of groups; return the recordings that were skipped."""
+        from stario.fusion.evaluation.groups import benchmark, write_benchmark
+
+        ours, theirs = self.estimating.model, self.against
+        weights = list(dict.fromkeys([ours, theirs or ours]))
+        for name in weights:
+            if _GROUP not in name and _SET not in name:
+                _for_group(name, "")  # fail on unloadable weights before preparing anything
+        judged: dict[str, Any] = {"weights": weights, "filtered": self.filtered}
+        work = partial(_alone, reading=self.reading, groups=groups, **judged)
+        found, skipped = common.each_used("evaluate", work, groups, self.jobs)
+        if found:
+            table = benchmark(found, by, ours, theirs)
+            if self.out is not None:
+                write_benchmark(self.out, table)
+            common.print_result(self.as_json, table.as_dict(), table.text())
+        return skipped
+
+
 @options.expanded
-def evaluate(
-    context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
-    paths: options.OptionalPaths = None,
-    data: options.Data = None,
-    split: str = typer.Option(
-        "test",
-        help="With --data: test, validation, training, holdout, all, open, or a list file "
-        "with lines of name, group.",
-    ),
-    by: options.Grouping | None = typer.Option(
-        None,
-        help="Evaluate the network alone by groups. Ground truth may be poses, positions or "
-        "waypoints.",
-    ),
-    against: str | None = typer.Option(
-        None,
-        help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
-        "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
-        "name stands for each recording's group, or its first word: leave-one-out.",
-    ),
-    filtered: bool = options.flag(
-        False, "--filtered", help="With --by: also report the filter's mean NIS; slow."
-    ),
-    jobs: options.Jobs = 1,
-    out: options.EvaluateOut = None,
-    as_json: options.Json = False,
-) -> None:
+def evaluate(given: _Evaluation) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
     from stario.network.training.splits import warn_of_learned
     from stario.sequences.files import check_folder
 
-    if out is not None:
-        check_folder(out)
-    _refuse_unused(context, by, bool(paths), data)
-    listed, skipped = _listed(reading, paths or [], data, split)
-    files = [entry.path for entry in listed]
-    if data is not None:
-        warn_of_learned([estimating.model, against or ""], files, data)
-    if by is not None:
-        groups = {entry.path: entry.group for entry in listed}
-        weights = estimating.model, against
-        skipped += _groups(groups, reading, by, *weights, filtered, jobs, out, as_json)
+    if given.out is not None:
+        check_folder(given.out)
+    given.refuse_unused()
+    groups, skipped = given.recordings()
+    files = [*groups]
+    if given.data is not None:
+        warn_of_learned([given.estimating.model, given.against or ""], files, given.data)
+    if given.by is None:
+        skipped += given.tracks(files)
     else:
-        skipped += _tracks(files, reading, estimating, jobs, out, as_json)
+        skipped += given.groups(groups, given.by)
     common.exit_if_skipped(skipped)
-
-
-def _refuse_unused(context: typer.Context, by: str | None, named: bool, data: Path | None) -> None:
-    """Refuse options that the chosen recordings and kind of evaluation do not use."""
-    if named:
-        options.refuse(context, "with PATH", "one of the two", "data")
-    if data is None:
-        options.refuse(context, "without --data", "use with --data", "split")
-    else:
-        options.refuse(context, "with --data", "use with PATH: name the archive", "where")
-    if by is None:
-        options.refuse(
-            context, "without --by", "a grouping, such as --by set", "against", "filtered"
-        )
-    else:
-        alone = "use without: the network alone is judged"
-        options.refuse(context, "with --by", alone, "config", "magnetometer", "declination")
-
-
-def _listed(
-    reading: options.Reading, paths: list[Path], data: Path | None, split: str
-) -> tuple[list[ListEntry], list[Skipped]]:
-    """Return the named recordings, or else those of the split, and the skipped paths."""
-    from stario.network.training.splits import read_packaged_list
-    from stario.sequences.datasets.splits import ListEntry
-
-    if paths:
-        files, skipped = reading.recordings(paths)
-        return [ListEntry(path, "") for path in files], skipped
-    if data is None:
-        raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
-    return read_packaged_list(split, data), []
-
-
-def _tracks(
-    files: list[Path],
-    reading: options.Reading,
-    estimating: options.Estimator,
-    jobs: int,
-    out: Path | None,
-    as_json: bool,
-) -> list[Skipped]:
-    """Print the table of recordings, whose tracks are written one by one; return those skipped."""
-    from stario.fusion.evaluation.compare import compare_recordings
-    from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.scores import joined
-    from stario.fusion.evaluation.text import summary, summary_table
-
-    settings, network = estimating.settings(), estimating.network()
-    model = network if jobs == 1 else estimating.model  # each process loads the weights once
-    origin = common.origin_of(files, reading, estimating, network)
-    skipped: list[Skipped] = []
-    found = []
-    with common.progress_bar("evaluate", 100 * len(files)) as progress:
-        outcomes = compare_recordings(
-            files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
-        )
-        for comparison in without_skipped(outcomes, skipped):
-            if out is not None:
-                write_recording(out, comparison)
-            found.append(comparison.scores)
-    if found:
-        scores = joined(found)
-        if out is not None:
-            write_summary(out, scores, settings, origin)
-        common.print_result(as_json, summary(scores), summary_table(scores))
-    return skipped
-
-
-def _groups(
-    groups: Mapping[Path, str],
-    reading: options.Reading,
-    by: options.Grouping,
-    ours: str,
-    theirs: str | None,
-    filtered: bool,
-    jobs: int,
-    out: Path | None,
-    as_json: bool,
-) -> list[Skipped]:
-    """Print and write the table of groups; return the recordings that were skipped."""
-    from stario.fusion.evaluation.groups import benchmark, write_benchmark
-
-    weights = list(dict.fromkeys([ours, theirs or ours]))
-    for name in weights:
-        if _GROUP not in name and _SET not in name:
-            _for_group(name, "")  # fail on unloadable weights before preparing anything
-    judged: dict[str, Any] = {"model": _for_group, "weights": weights, "filtered": filtered}
-    work = partial(_alone, reading=reading, groups=groups, **judged)
-    found, skipped = common.each_used("evaluate", work, groups, jobs)
-    if found:
-        table = benchmark(found, by, ours, theirs)
-        if out is not None:
-            write_benchmark(out, table)
-        common.print_result(as_json, table.as_dict(), table.text())
-    return skipped
 
 
 def _alone(
@@ -265,7 +250,7 @@ def _alone(
     """Return what `alone_on` does of a path; further processes know it by its name."""
     from stario.fusion.evaluation.groups import alone_on
 
-    return alone_on(reading.read(path), path, groups[path], **judged)
+    return alone_on(reading.read(path), path, groups[path], _for_group, **judged)
 
 
 def _for_group(name: str, group: str) -> Model:

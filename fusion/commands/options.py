@@ -183,8 +183,7 @@ class Estimator:
 
     config: Config = None
     model: Annotated[
-        str,
-        _estimation(help="Weights: default, open, or a safetensors or ONNX file."),
+        str, _estimation(help="Weights: default, open, or a safetensors or ONNX file.")
     ] = "default"
     magnetometer: Annotated[
         bool, _estimation(metavar="", help="Use the magnetometer, if there is one.")
@@ -268,8 +267,7 @@ class Place(Map):
     """What is known of a recording's place, and what becomes of it."""
 
     waypoints: Annotated[
-        str | None,
-        _place(help="Known positions of the file, such as waypoints: use or compare."),
+        str | None, _place(help="Known positions of the file, such as waypoints: use or compare.")
     ] = None
     closed: Annotated[
         bool, _place(metavar="", help="The track ends where it began, to a metre.")

@@ -285,17 +285,14 @@ def _validation(
 
 
 def _print_epoch(report: EpochReport) -> None:
-    if report.epoch == 0:
-        words = f"initial weights: validation {report.validation_error:.4f} m^2"
-        typer.echo(words, err=True)
-        return
-    typer.echo(
-        f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
-        f"validation {report.validation_error:.4f} m^2; "
-        f"{report.windows_per_second:.0f} windows/s, {report.drawing_share:.0%} of the "
-        "time spent drawing them",
-        err=True,
-    )
+    words = f"initial weights: validation {report.validation_error:.4f} m^2"
+    if report.epoch:
+        words = (
+            f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
+            f"validation {report.validation_error:.4f} m^2; {report.windows_per_second:.0f} "
+            f"windows/s, {report.drawing_share:.0%} of the time spent drawing them"
+        )
+    typer.echo(words, err=True)
 
 
 def _recipe(

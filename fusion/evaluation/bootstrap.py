@@ -11,6 +11,7 @@ weights, and so have the seeds of a network.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,55 +74,37 @@ def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
     if runs.empty:
         return pd.DataFrame(columns=["network", "rank", "rank_low", "rank_high", "ratio"])
     rng = np.random.default_rng(0)
-    of_sets = [_of_set(part, rng) for _, part in runs.groupby("set", sort=False)]
+    of_sets = [_resampled(part, _UNITS[1:], rng) for _, part in runs.groupby("set", sort=False)]
     logs = pd.DataFrame(np.mean(of_sets, axis=0), columns=runs["squares"].columns)
     by_name = logs.T.groupby(level="network", sort=False).mean()  # (N, 1 + R), first the whole
     places = by_name.rank(method="first").astype(int).to_numpy()
     low, high = np.percentile(places[:, 1:], _BOUNDS, axis=1, method="nearest")
-    base = by_name.loc[against] if against in by_name.index else None
-    ratios = [
-        None if base is None else _interval((errors - base).to_numpy(), len(runs))
-        for _, errors in by_name.iterrows()
-    ]
+    ratios: list[Interval | None] = [None] * len(by_name)
+    if against in by_name.index:
+        apart = (by_name - by_name.loc[against]).to_numpy()
+        bounds = np.full((2, len(apart)), np.nan)
+        if len(runs) >= _MIN_BLOCKS:
+            bounds = np.percentile(apart[:, 1:], _BOUNDS, axis=1)
+        found = np.exp(np.vstack([apart[:, 0], bounds])).T
+        ratios = [Interval(*each) for each in found.tolist()]
     columns = {"network": by_name.index, "rank": places[:, 0], "rank_low": low, "rank_high": high}
     return pd.DataFrame({**columns, "ratio": ratios})
 
 
-def _interval(differences: FloatArray, blocks: int) -> Interval:
-    """Return the ratio from differences (1 + R,) of mean log errors, those of all blocks first."""
-    bounds = [math.nan, math.nan]
-    if blocks >= _MIN_BLOCKS:
-        bounds = np.exp(np.percentile(differences[1:], _BOUNDS)).tolist()
-    return Interval(math.exp(differences[0]), *bounds)
+def _resampled(part: pd.DataFrame, units: Sequence[str], rng: np.random.Generator) -> FloatArray:
+    """Return mean log errors (1 + R, runs): of all, then of the replicates.
 
-
-def _of_set(part: pd.DataFrame, rng: np.random.Generator) -> FloatArray:
-    """Return the mean log errors of a set (1 + R, runs), those of the replicates from row 1 on."""
-    groups = []
-    for _, group in part.groupby("group", sort=False):
-        recordings = [
-            _of_recording(one["squares"].to_numpy(), one["count"].to_numpy(), rng)
-            for _, one in group.groupby("recording", sort=False)
-        ]
-        groups.append(_mean_of_draws(np.stack(recordings), rng))
-    return _mean_of_draws(np.stack(groups), rng)
-
-
-def _of_recording(squares: FloatArray, count: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the log errors of a recording (1 + R, runs) from its blocks (B, runs)."""
-    rows = rng.integers(len(squares), size=(REPLICATES, len(squares)))
-    whole, drawn = (
-        np.log(np.maximum(sums, 1e-12) / counts)
-        for sums, counts in (
-            (squares.sum(axis=0), count.sum(axis=0)),
-            (squares[rows].sum(axis=1), count[rows].sum(axis=1)),
-        )
-    )
-    return np.asarray(0.5 * np.vstack([whole, drawn]))
-
-
-def _mean_of_draws(values: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the mean (1 + R, runs) of members (n, 1 + R, runs), each replicate's drawn anew."""
+    Replicates draw from the members by the first of the units, whose members are drawn likewise;
+    without units, from the blocks.
+    """
+    if not units:
+        squares, count = part["squares"].to_numpy(), part["count"].to_numpy()
+        rows = rng.integers(len(part), size=(REPLICATES, len(part)))
+        rows = np.vstack([np.arange(len(part)), rows])
+        sums = np.maximum(squares[rows].sum(axis=1), 1e-12)
+        return np.asarray(0.5 * np.log(sums / count[rows].sum(axis=1)))
+    members = part.groupby(units[0], sort=False)
+    values = np.stack([_resampled(member, units[1:], rng) for _, member in members])
     rows = rng.integers(len(values), size=(len(values), REPLICATES))
     drawn = np.take_along_axis(values[:, 1:], rows[..., None], axis=0)
     return np.asarray(np.concatenate([values[:, :1], drawn], axis=1).mean(axis=0))

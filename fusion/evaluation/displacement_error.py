@@ -82,7 +82,6 @@ FIGURES = {
 }
 """Figures of a recording and their meaning; NaN if its kind of truth does not provide one."""
 
-
 _MIN_PATH_M = 1.0
 """Length of the true path [m] below which a recording is not compared."""
 
@@ -121,10 +120,7 @@ def usable_streams(sequence: ImuSequence) -> list[LevelledStream]:
     """
     check_units(sequence)
     warn(sequence.name, dead_axes(sequence))
-    streams = levelled_streams(sequence)
-    if not streams:
-        raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
-    return streams
+    return levelled_streams(sequence)
 
 
 class _AtTicks(NamedTuple):
@@ -187,8 +183,8 @@ def recording_errors(
         The length `path_m` of the true path that was compared [m], and `FIGURES`. It is 0, and they
         are unknown, if the device hardly moved: errors at rest are related to nothing, and would
         count in means of ratios like those of a walk.
-        Blocks of 30 s of each `metric` "rms_1s_m" to "rms_30s_m": sum of the squared errors,
-        `squares` [m^2], and their `count`. For waypoints, their residuals replace the 10 s errors.
+        `blocks_of` each `metric` "rms_1s_m" to "rms_30s_m" [m^2]. For waypoints, their residuals
+        replace the 10 s errors.
 
     Raises:
         InputError: as for `known_truth`.
@@ -211,7 +207,7 @@ def recording_errors(
     paths = table[table["metric"] == "path"].groupby("piece")["error"].sum()
     path = float(paths.sum())
     if path < _MIN_PATH_M:
-        return {"path_m": 0.0, **dict.fromkeys(FIGURES, np.nan)}, _blocks(table[:0])
+        return {"path_m": 0.0, **dict.fromkeys(FIGURES, np.nan)}, blocks_of(table[:0])
     rms = np.sqrt(by_metric["squares"].mean())
     usual_path = float((paths**2).sum()) / path  # of a piece, weighted by lengths
     figures = {
@@ -224,12 +220,17 @@ def recording_errors(
     }
     if kind == "waypoints":
         table["metric"] = table["metric"].replace("ate_fit_m", "rms_10s_m")
-    return figures, _blocks(table[table["metric"].str.startswith("rms")])
+    return figures, blocks_of(table[table["metric"].str.startswith("rms")])
 
 
-def _blocks(errors: pd.DataFrame) -> pd.DataFrame:
+def blocks_of(errors: pd.DataFrame) -> pd.DataFrame:
+    """Return the sum of `squares` and their `count` in blocks of 30 s, numbered by `metric`.
+
+    Errors have the columns `metric`, `piece`, `second` and `squares`.
+    """
     by = ["metric", "piece", errors["second"] // BLOCK_SECONDS]
-    return errors.groupby(by)["squares"].agg(squares="sum", count="count").reset_index("metric")
+    sums = errors.groupby(by)["squares"].agg(squares="sum", count="count").reset_index("metric")
+    return sums.assign(block=sums.groupby("metric").cumcount())
 
 
 def _positions(piece: Piece, known: PositionTrack, poses: Trajectory | None) -> _Errors:
@@ -264,7 +265,7 @@ def _interpolated(
     before = np.searchsorted(time, ticks, side="right") - 1
     inside = (before >= 0) & (before < len(bad))
     inside[inside] = ~bad[before[inside]]
-    xy = np.interp(ticks, time, position_W[:, 0]) + 1j * np.interp(ticks, time, position_W[:, 1])
+    xy = np.interp(ticks, time, planar(position_W))
     breaks = np.searchsorted(time[1:][bad], ticks, side="right")
     return np.where(inside, xy, complex(np.nan, np.nan)), breaks
 
@@ -296,7 +297,7 @@ def _waypoints(piece: Piece, known: PositionTrack) -> _Errors:
     time, truth = known.time[inside], planar(known.position_W[inside])
     if len(time) < 3:
         return
-    estimated = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
+    estimated = np.interp(time, ticks, track)
     seconds = time - ticks[0]
     yield "ate_fit_m", seconds, np.abs(fit_yaw_and_position(estimated, truth) - truth)
     yield "path", seconds[1:], np.abs(np.diff(truth))

@@ -157,10 +157,9 @@ class Benchmark:
         lines = [head]
         for line, row in zip(body, rows, strict=True):
             lines.append(line)
-            for key in RATIOS:
-                if isinstance(row[key], Interval):
-                    seconds = key.removeprefix("ratio_").removesuffix("s")
-                    lines.append(f"{row['group']}: ratio over {seconds} s: {row[key]:.3f}")
+            for horizon in HORIZONS:
+                if isinstance(ratio := row[f"ratio_{horizon}s"], Interval):
+                    lines.append(f"{row['group']}: ratio over {horizon} s: {ratio:.3f}")
         lines += [conclusion] if (conclusion := verdict(self.rows)) else []
         lines += [f"ours: {self.ours}", *([f"theirs: {self.theirs}"] if self.theirs else [])]
         return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
@@ -217,8 +216,7 @@ def alone_on(
         if filtered and not isinstance(network, PedestrianDeadReckoning):
             nis = Navigator(network, backend="ekf").run(sequence).nis
             figures[name]["nis_filtered"] = nis or np.nan
-        block = errors.groupby("metric").cumcount()
-        blocks.append(errors.assign(**unit, network=name, seed=0, block=block))
+        blocks.append(errors.assign(**unit, network=name, seed=0))
     return scored(str(path), figures, **named, truth=kind), joined(blocks)
 
 

@@ -108,7 +108,7 @@ def placed(track: Track, known: PositionTrack, least: int = 1) -> PositionTrack 
     They are rotated about the vertical and shifted to fit the track best, in its frame; a single
     one lies exactly on it. None if there are fewer than `least`.
     """
-    inside = known.valid & _within(track, known.time)
+    inside = _inside(track, known)
     time, truth = known.time[inside], known.position_W[inside]
     if len(time) < least:
         return None
@@ -125,18 +125,17 @@ def fitted_georeference(track: Track, known: PositionTrack) -> Georeference | No
     """
     if known.latlon_deg is None:
         return None
-    with_coordinates = known.valid & np.isfinite(known.latlon_deg).all(axis=1)
-    inside = with_coordinates & _within(track, known.time)
+    inside = _inside(track, known) & np.isfinite(known.latlon_deg).all(axis=1)
     if inside.sum() < MIN_POSITIONS:
         return None
     return georeference_of(known.latlon_deg[inside], _track_at(track, known.time[inside]))
 
 
-def _within(track: Track, time: FloatArray) -> BoolArray:
-    """Return which times (N,) lie within a track and in none of its gaps."""
+def _inside(track: Track, known: PositionTrack) -> BoolArray:
+    """Return which valid positions (N,) lie within a track and in none of its gaps."""
     # A track of steps has two poses per second: none of its intervals is a gap.
     longest = max(MAX_TRUTH_GAP, 1.5 * float(np.median(np.diff(track.time))))
-    return track.trajectory.covers(time, longest)
+    return known.valid & track.trajectory.covers(known.time, longest)
 
 
 def _track_at(track: Track, time: FloatArray) -> FloatArray:

@@ -26,7 +26,6 @@ from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.inference import Predictor, StatefulInference
 from stario.fusion.values.state import Track
 from stario.sequences.attitude.rotations import about_z
-from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import (
     TICK_SAMPLES,
     TICKS_PER_SECOND,
@@ -99,8 +98,6 @@ def pedestrian_track(sequence: ImuSequence) -> Track:
     """
     began = perf_counter()
     streams = levelled_streams(sequence)
-    if not streams:
-        raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
     paths, attitudes, end, facing = [], [], 0j, 0j
     for stream in streams:
         faces = planar(stream.facing_N)

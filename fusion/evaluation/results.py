@@ -30,13 +30,7 @@ from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
 from stario.sequences.errors import InputError
-from stario.sequences.files import (
-    check_folder,
-    make_folder,
-    temporary_path,
-    write_json,
-    write_npz,
-)
+from stario.sequences.files import check_folder, make_folder, temporary_path, write_json, write_npz
 from stario.sequences.readers.tum import write_tum
 
 if TYPE_CHECKING:

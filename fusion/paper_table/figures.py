@@ -29,7 +29,6 @@ _STYLES = ("-", "--", ":")
 _MARKERS = "osD^vP"
 _BASELINE = "R-ResNet"
 
-
 Samples = Mapping[str, Mapping[str, Drawn]]
 """Tracks of networks with the true attitude, aligned with the truth, by the recording's path."""
 

@@ -10,18 +10,21 @@ import hashlib
 import importlib
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
-from functools import cache, partial
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, lru_cache, partial
 from itertools import product
 from pathlib import Path
 from time import process_time
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation.compare import TRACK_TITLES
-from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS, FIGURES
+from stario.fusion.evaluation.displacement_error import FIGURES, blocks_of
 from stario.fusion.evaluation.groups import alone_on
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import (
@@ -34,24 +37,27 @@ from stario.fusion.evaluation.scores import LABELS, joined, scored
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.navigator import Navigator
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
-from stario.fusion.paper_table.training import (
-    TEMPORARY_FILES,
-    ReaderConfig,
-    recipe_digest,
-    recording_state,
-    run_recipe,
-    train_run,
-)
 from stario.network.architectures import ARCHITECTURES, architecture
 from stario.network.model import load_model
-from stario.network.training.config import TrainingConfig
+from stario.network.training.config import TrainingConfig, training_config
+from stario.network.training.data import (
+    RecordingStreams,
+    mix_sources,
+    recording_streams,
+    validation_data,
+)
+from stario.network.training.history import EpochReport, History
+from stario.network.training.made import cached_walks
+from stario.network.training.train import train
 from stario.sequences.accuracy.metrics import PoseErrors, align, evaluate_track, pose_errors
 from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
+from stario.sequences.datasets.stream_cache import recorded, recording_stamps
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.files import write_json
 from stario.sequences.lazy import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.windows import WINDOW_SAMPLES, Attitude
 
 LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
 """Networks that are completed first, and with several seeds."""
@@ -66,6 +72,34 @@ Drawn = dict[str, FloatArray]
 
 MAX_DRAWN = 4
 """Number of recordings whose tracks are kept for a figure."""
+
+_EPOCH_STEPS = 250
+"""Maximum steps between two checkpoints: what an interrupted run loses."""
+
+_VALIDATION_SAMPLES = 60 * WINDOW_SAMPLES
+"""Maximum samples of each validation stretch: all are evaluated after every epoch."""
+
+TEMPORARY_FILES = ("checkpoint.safetensors", "clock.json")
+"""Files of a training run that are not needed once its result is recorded."""
+
+_WALKS, _VALIDATION_WALKS = 40, 8
+"""Simulated walks for training and validation windows where no recording has poses: the same for
+every run, so that only the networks differ."""
+
+
+@dataclass(frozen=True)
+class ReaderConfig:
+    """How recordings are read, on any machine that works on a run; told apart by the cache alone.
+
+    Attributes:
+        read: function that reads the recording at a path; must be picklable.
+        options: what `read` depends on besides the path, as plain values.
+        cache: folder that caches windows for later runs.
+    """
+
+    read: Callable[[Path], ImuSequence] = field(compare=False)
+    options: dict[str, object] = field(compare=False)
+    cache: Path
 
 
 @dataclass(frozen=True)
@@ -98,11 +132,22 @@ class Run:
     def digest(self) -> str:
         """Digest of everything that its results depend on except the code."""
         test = [recording_state(entry.path) for entry in self.dataset.test]
-        if self.recipe is None:
-            learned = "" if self.network == PDR else _weights_sha256(self.network)
+        if self.recipe is not None:
+            parts = (self.dataset.training, self.dataset.validation)
+            states = [[*map(recording_state, part)] for part in parts]
+            learned = _digest([asdict(self.recipe), states])
         else:
-            learned = recipe_digest(self.recipe, self.dataset)
-        return hashlib.sha256(json.dumps([self.network, learned, test]).encode()).hexdigest()
+            learned = "" if self.network == PDR else _weights_sha256(self.network)
+        return _digest([self.network, learned, test])
+
+
+def _digest(inputs: object) -> str:
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
+def recording_state(path: Path) -> list[object]:
+    """Return a recording's path and the stamps of its files, which tell that it has changed."""
+    return [str(path), *recording_stamps(path)]
 
 
 @cache
@@ -147,17 +192,72 @@ def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
     return run
 
 
-def read_run(run: Run, out: Path) -> dict[str, object] | None:
-    """Return the content of a run's `tested.json` and `trained.json`; None if it is not completed.
+def train_run(
+    dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: ReaderConfig
+) -> dict[str, object]:
+    """Train a run's network, resuming from its checkpoint; write the model and `TEMPORARY_FILES`.
+
+    Returns:
+        Plain values: training error of the last epoch and validation error of the best one, whose
+        weights are kept [m^2], number of steps, windows per second, computing time over all
+        processes that continued the run in turn [s], the recipe, and the skipped recordings.
 
     Raises:
-        ConfigError: it was completed with another recipe, other weights or other recordings.
+        InputError, ConfigError: as for `stario.network.training.train.train`.
     """
-    folder = run.folder(out)
-    content = _read_if_done(run, folder / "tested.json")
-    if content is None or run.recipe is None:
-        return content
-    return content | {"trained": _read(folder / "trained.json")}
+    streams, skipped = _streams(dataset.training, recipe.attitude, reading)
+    held_out, missing = _streams(dataset.validation, recipe.attitude, reading)
+    simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
+    walks = [] if any(recording.has_poses for recording in streams) else simulated(_WALKS, 0)
+    data = mix_sources(streams, walks, recipe.shares, recipe.reach)
+    validation = validation_data(held_out, partial(simulated, _VALIDATION_WALKS, 1))
+    began, clock = process_time(), folder / TEMPORARY_FILES[1]
+    before = float(json.loads(clock.read_text())) if clock.exists() else 0.0  # of killed processes
+    train(
+        recipe,
+        data,
+        replace(validation, streams=[s.part(0, _VALIDATION_SAMPLES) for s in validation.streams]),
+        folder,
+        on_epoch=lambda report: write_json(clock, before + process_time() - began),
+    )
+    rows: list[dict[str, Any]] = json.loads((folder / "log.json").read_text(encoding="utf-8"))
+    for row in rows:  # in JSON, errors that are not finite are null
+        row.update({name: math.nan for name, value in row.items() if value is None})
+    reports = [EpochReport(**row) for row in rows]
+    return {
+        "steps": recipe.steps,
+        "windows_per_s": float(np.mean([report.windows_per_second for report in reports])),
+        "seconds": before + process_time() - began,
+        "training_error_m2": reports[-1].training_error,
+        "validation_error_m2": History(recipe, reports).best().validation_error,
+        "recipe": asdict(recipe),
+        "skipped": [asdict(failure) for failure in skipped + missing],
+    }
+
+
+@lru_cache(maxsize=2)  # training and validation part of the set that runs are completed for
+def _streams(
+    files: tuple[Path, ...], attitude: Attitude, reading: ReaderConfig
+) -> tuple[list[RecordingStreams], list[Skipped]]:
+    """Return the streams of each recording; later runs of the same set reuse them."""
+    outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, attitude)
+    return recording_streams(zip(files, outcomes, strict=True))
+
+
+def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return what the completed runs have in `tested.json` and in `trained.json`, by set.
+
+    Raises:
+        ConfigError: a run was completed with another recipe, other weights or other recordings.
+    """
+    found: dict[str, list[dict[str, Any]]] = {}
+    for run in runs:
+        folder = run.folder(out)
+        if (content := _read_if_done(run, folder / "tested.json")) is not None:
+            if run.recipe is not None:
+                content["trained"] = _read(folder / "trained.json")
+            found.setdefault(run.dataset.name, []).append(content)
+    return found
 
 
 def test_scores(
@@ -211,9 +311,8 @@ def _recording(
 
 def _position_blocks(poses: PoseErrors) -> pd.DataFrame:
     since, squares = poses.estimate.time - poses.estimate.time[0], poses.position_W[:, :2] ** 2
-    errors = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS)
-    sums = errors.agg(squares="sum", count="count").reset_index(drop=True)
-    return sums.assign(block=sums.index, metric="ate")
+    errors = {"metric": "ate", "piece": 0, "second": since, "squares": squares.sum(axis=1)}
+    return blocks_of(pd.DataFrame(errors))
 
 
 def _protocol_errors(
@@ -297,6 +396,24 @@ def table_runs(
             for name in leading if seed else names:
                 runs.append(Run(dataset, name, seed, run_recipe(recipe, name, seed, steps)))
     return runs
+
+
+def run_recipe(
+    values: dict[str, object], network: str, seed: int, steps: int | None
+) -> TrainingConfig:
+    """Return the recipe of a run: the common values with a network, a seed and a number of steps.
+
+    It is approximate, since epochs have equal lengths; None for the common recipe's.
+
+    Raises:
+        ConfigError: a setting is unknown or out of range.
+    """
+    recipe = training_config({**values, "architecture": network, "seed": seed})
+    steps = recipe.steps if steps is None else steps
+    epochs = max(1, math.ceil(steps / _EPOCH_STEPS))
+    per_epoch = max(1, round(steps / epochs))
+    lengths = {"epochs": epochs, "epoch_windows": per_epoch * recipe.batch, "patience": epochs}
+    return training_config({**values, "architecture": network, "seed": seed, **lengths})
 
 
 @contextmanager

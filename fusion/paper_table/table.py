@@ -21,7 +21,7 @@ from stario.fusion.paper_table.runs import (
     TRUE_ATTITUDE,
     Drawn,
     Run,
-    read_run,
+    completed_runs,
 )
 from stario.fusion.paper_table.sets import DataSet, published
 from stario.network.architectures import ARCHITECTURES
@@ -35,8 +35,7 @@ REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
 
 Completed = Sequence[Mapping[str, Any]]
-"""Results (`read_run`) of a set's runs."""
-
+"""Results (`completed_runs`) of a set's runs."""
 
 COLUMNS = {
     "ate": ("ATE [m]", TRUE_ATTITUDE, "ate_m"),
@@ -83,23 +82,6 @@ class SetTable:
     scores: pd.DataFrame
     rows: pd.DataFrame
     about: dict[str, Any]
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the set's part of `table.json`."""
-        return self.about | {"rows": self.rows.to_dict("records")}
-
-
-def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, list[Mapping[str, Any]]]:
-    """Return the results of the completed runs, by set.
-
-    Raises:
-        ConfigError: a run was completed with another recipe, other weights or other recordings.
-    """
-    found: dict[str, list[Mapping[str, Any]]] = {}
-    for run in runs:
-        if (content := read_run(run, out)) is not None:
-            found.setdefault(run.dataset.name, []).append(content)
-    return found
 
 
 def set_table(
@@ -211,7 +193,10 @@ def write_results(
         file.write(text)
     content = {
         "recipe": asdict(recipe),
-        "sets": {name: table.as_dict() for name, table in tables.items()},
+        "sets": {
+            name: table.about | {"rows": table.rows.to_dict("records")}
+            for name, table in tables.items()
+        },
         "costs": [asdict(row) for row in costs],
         "work": work.to_dict("index"),
         "conventions": WORDS,

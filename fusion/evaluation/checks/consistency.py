@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.scores import joined, scored
+from stario.fusion.evaluation.scores import scored
 from stario.fusion.filter import estimator
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
@@ -26,7 +26,7 @@ from stario.fusion.filter.jacobians import CORE, REPORTED
 from stario.fusion.filter.record import innovations_of
 from stario.fusion.imu.inference import WindowDisplacement, slope_variance
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.recording import Progress, cut_recording, silent
+from stario.fusion.recording import cut_recording
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.lie import log_se23, yaw_rotation
 from stario.sequences.accuracy.nees import nees_bounds
@@ -49,7 +49,6 @@ _DISPLACEMENT_SIGMA = 0.1
 """Standard deviation of the displacements per axis [m], as of a good network. Far smaller values
 reveal that an unknown initial speed and an unknown yaw interact beyond first order: with 0.03 m the
 NEES of the first minute is 19 instead of 16."""
-
 
 _STYLE = WalkStyle(carry="handheld")
 """Carried smoothly: strapdown integration of 200 Hz has errors far below those that are drawn. A
@@ -83,40 +82,24 @@ def consistency_text(found: dict[str, Any]) -> str:
 
 
 def consistency(
-    config: NavigatorConfig,
-    yaw_sigma: float = YAW_SIGMA,
-    runs: int = 20,
-    seconds: float = 300.0,
-    seed: int = 0,
-    progress: Progress = silent,
+    config: NavigatorConfig, yaw_sigma: float = YAW_SIGMA, seconds: float = 300.0, seed: int = 0
 ) -> pd.DataFrame:
-    """Score the filter on simulated walks with errors drawn from its configured deviations.
+    """Score the filter on a simulated walk with errors drawn from its configured deviations.
 
-    Figures of each run: NEES of the 15 states over all times (`nees`, expected: 15) and at the end
+    Figures: NEES of the 15 states over all seconds (`nees`, expected: 15) and at the end
     (`nees_end`); NEES of `yaw` (1); `nis` of the measurements (3); at the end, the yaw's reported
     standard deviation `yaw_sigma` and its error `yaw_error` [rad].
 
     The configuration is that of the filter and of the simulated IMU's noise; `yaw_sigma` [rad] is
-    that of the initial yaw. Walks have seeds from `seed` on, and are `seconds` long.
+    that of the initial yaw.
 
     Raises:
-        InputError: there are no runs, or they are shorter than two seconds.
+        InputError: the walk is shorter than two seconds.
     """
-    if runs < 1 or not seconds >= 2.0:
-        raise InputError("runs, seconds", f"{runs}, {seconds:g}", "at least 1 run of 2 s")
+    if not seconds >= 2.0:
+        raise InputError("seconds", f"{seconds:g}", "at least 2 s")
     # The errors are drawn as configured: there is nothing to adapt to.
     config = replace(config, filter=replace(config.filter, adaptive=False))
-    found = []
-    for k in range(runs):
-        found.append(
-            scored(f"walk {seed + k}", {"filtered": _run(config, yaw_sigma, seconds, seed + k)})
-        )
-        progress((k + 1) / runs)
-    return joined(found)
-
-
-def _run(config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int) -> dict[str, float]:
-    """Return the figures of a run, of the errors at every second."""
     rng = np.random.default_rng(seed)
     track = generate_walk(seed, seconds, style=_STYLE)
     exact = simulate_imu(track, RATE, PERFECT_IMU, gravity=config.gravity)
@@ -148,7 +131,7 @@ def _run(config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int) -
             k = round(interval.stop * RATE)
             rows.append(_errors(record.estimate, walk, k, b_g[k], b_a[k]))
     nees, yaw_square, yaw_variance = np.array(rows).T
-    return {
+    figures = {
         "nees": float(nees.mean()),
         "nees_end": float(nees[-1]),
         "yaw": float((yaw_square / yaw_variance).mean()),
@@ -156,6 +139,7 @@ def _run(config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int) -
         "yaw_sigma": math.sqrt(yaw_variance[-1]),
         "yaw_error": math.sqrt(yaw_square[-1]),
     }
+    return scored(f"walk {seed}", {"filtered": figures})
 
 
 def _drawn_start(

@@ -63,20 +63,16 @@ class Fault:
 def faults(duration: float) -> list[Fault]:
     """Return every fault of the table, for a recording of this duration [s]."""
     half, block = 0.5 * duration, 5.0 / duration
-    gaps = {f"gap of {s:g} s": partial(gap, start=half, seconds=s) for s in (0.1, 1.0, 3.0)}
-    dropped = {f"{s:.0%} of samples dropped": partial(drops, share=s) for s in (0.05, 0.2)}
-    resampled = {f"{rate:g} Hz": partial(_resampled, rate=rate) for rate in (190.0, 500.0)}
-    nans = {
-        f"one NaN in {name}": partial(_one_nan, field=name) for name in ("time", "gyro", "accel")
-    }
     return [
         Fault("none"),
         Fault("network off by 1 m for 5 s", modify_predictions=partial(_offset_block, share=block)),
         Fault("5 % of windows off by 2 m", modify_predictions=_outliers),
         Fault("covariance 100 times too small", modify_predictions=_overconfident),
-        *(Fault(*item) for part in (gaps, dropped, resampled) for item in part.items()),
+        *(Fault(f"gap of {s:g} s", partial(gap, start=half, seconds=s)) for s in (0.1, 1.0, 3.0)),
+        *(Fault(f"{s:.0%} of samples dropped", partial(drops, share=s)) for s in (0.05, 0.2)),
+        *(Fault(f"{rate:g} Hz", partial(_resampled, rate=rate)) for rate in (190.0, 500.0)),
         Fault("accelerometer clipped", _clipped),
-        *(Fault(*item) for item in nans.items()),
+        *(Fault(f"one NaN in {k}", partial(_one_nan, field=k)) for k in ("time", "gyro", "accel")),
         Fault("one NaN from the network", modify_predictions=partial(_nan_prediction, which=0)),
         Fault("one NaN in the covariance", modify_predictions=partial(_nan_prediction, which=1)),
         Fault("1 % duplicated, 1 % swapped", _reordered),

@@ -1,15 +1,8 @@
 """The fusion on recordings, by group: beside its network, with fixes, samples missing, heights.
 
-- Benefit: errors of the filtered and the smoothed track, and of a stream's fixed-lag graph,
-  relative to the network's, whose displacements are chained along the attitude levelled from the
-  IMU. They are horizontal, root mean square after a fit of yaw and position: over all poses, or at
-  the waypoints. Simulated walks, measured with white noise of known size, show the estimators
-  alone.
-- Fixes: true positions at equal intervals with white errors; is the error as large as reported?
-  Only the second half of each track counts: by then several fixes have determined the direction.
-- Missing samples: a short gap at each of several instants, and samples dropped at random. Results
-  must not depend on a few samples. All tracks begin in the same pose, so ends need no alignment.
-- Heights and floors, with the barometer and without, at waypoints with floors or true poses.
+Errors are horizontal, root mean square after a fit of yaw and position: over all poses, or at the
+waypoints. With fixes only the second half of each track counts: by then several have determined the
+direction. Tracks with samples missing begin in the same pose, so ends need no alignment.
 """
 
 from __future__ import annotations
@@ -35,14 +28,7 @@ from stario.fusion.evaluation.checks.faults import (
 from stario.fusion.evaluation.compare import Metrics, measure, navigators
 from stario.fusion.evaluation.displacement_error import known_truth
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error, true_path
-from stario.fusion.evaluation.scores import (
-    Column,
-    by_track,
-    median_degrees,
-    parts,
-    scored,
-    table,
-)
+from stario.fusion.evaluation.scores import Column, by_track, median_degrees, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track, true_poses
 from stario.fusion.filter import estimator
 from stario.fusion.filter.record import innovations_of
@@ -87,12 +73,11 @@ _MIN_FIXES, _MIN_PATH = 4, 1.0
 
 
 def fusion_gain(
-    model: Predictor,
-    sequence: ImuSequence,
-    config: NavigatorConfig,
-    graph: bool = False,
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, graph: bool = False
 ) -> pd.DataFrame:
     """Score the network alone and the filter: `error_m`, its `ratio` to the network's, NIS.
+
+    The network's displacements are chained along the attitude levelled from the IMU.
 
     The error is also given in percent of the true path (of the legs between waypoints; not where
     positions are known whose noise adds up), and the processor time without the network
@@ -117,9 +102,7 @@ def simulated_gain(seed: int, seconds: float, graph: bool = False) -> pd.DataFra
     estimators are given the exact standard deviations. Person and carry are drawn at random.
     """
     errors = ImuErrors(
-        noise=ImuNoise(),
-        gyro_turn_on=PHONE_IMU.gyro_turn_on,
-        accel_turn_on=PHONE_IMU.accel_turn_on,
+        noise=ImuNoise(), gyro_turn_on=PHONE_IMU.gyro_turn_on, accel_turn_on=PHONE_IMU.accel_turn_on
     )
     config = matched_config(errors)
     config = replace(config, filter=replace(config.filter, update_rate=1))

@@ -51,7 +51,6 @@ _MIN_KNOWN = 3
 CARRIES = ("handheld", "pocket", "swinging", "bag")
 """How the device is carried in the simulated walks, one each."""
 
-
 _COLUMNS = (
     Column("n", "step", ".0f", len),
     Column("without [m]", "error_without"),

@@ -108,13 +108,11 @@ def motion(sequence: ImuSequence) -> dict[str, float]:
     """
     time = even_grid(float(sequence.time[0]), float(sequence.time[-1]), 1.0 / _RATE)
     force = np.linalg.norm(interpolated(time, sequence.time, sequence.accel), axis=1)
-    found = {f"force_{low:g}": rms(_in_band(force, low, high)[:, None]) for low, high in BANDS}
+    found = {}
+    for low, high in BANDS:
+        band = butter(4, (low, high), "bandpass", fs=_RATE, output="sos")
+        found[f"force_{low:g}"] = rms(sosfiltfilt(band, force)[:, None])
     return {**found, "rate": rms(sequence.gyro), "step_rate": float(np.median(_step_rates(force)))}
-
-
-def _in_band(values: FloatArray, low: float, high: float) -> FloatArray:
-    filtered = sosfiltfilt(butter(4, (low, high), "bandpass", fs=_RATE, output="sos"), values)
-    return np.asarray(filtered, dtype=np.float64)
 
 
 def _step_rates(force: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from time import perf_counter
+from timeit import timeit
 
 import numpy as np
 import pandas as pd
@@ -46,19 +47,13 @@ def speed(model: Predictor) -> pd.Series[float]:
         alone = Navigator(model, config, backend="ekf")
         observed = alone.observe(sequence)
         works[f"filter_{rate}_hz_s_per_min"] = partial(alone.track, observed)
-    rows = []
-    for _ in range(_RUNS):  # in turn, so that all are timed under the same load
-        times = {}
-        for name, work in works.items():
-            began = perf_counter()
-            work()
-            times[name] = (perf_counter() - began) / (sequence.duration / 60.0)
-        rows.append(times)
+    minutes = sequence.duration / 60.0
+    rows = [  # in turn, so that all are timed under the same load
+        {name: timeit(work, number=1) / minutes for name, work in works.items()}
+        for _ in range(_RUNS)
+    ]
     plain, with_update = _push_times(Navigator(model), sequence)
-    samples = {
-        "push_us": np.median(plain),
-        "push_with_update_us": np.percentile(with_update, 99),
-    }
+    samples = {"push_us": np.median(plain), "push_with_update_us": np.percentile(with_update, 99)}
     return pd.concat([pd.DataFrame(rows).median(), pd.Series(samples)])
 
 

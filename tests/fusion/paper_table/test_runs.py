@@ -15,19 +15,20 @@ from typer.testing import CliRunner
 from stario.fusion.commands.cli import app
 from stario.fusion.evaluation.scores import values
 from stario.fusion.paper_table import runs as runs_module
-from stario.fusion.paper_table import training
 from stario.fusion.paper_table.runs import (
     LEADING,
     PROTOCOLS,
     TRUE_ATTITUDE,
+    ReaderConfig,
     Run,
     backend,
     complete_run,
+    completed_runs,
+    run_recipe,
     table_runs,
 )
 from stario.fusion.paper_table.sets import DataSet, folder_set
-from stario.fusion.paper_table.table import completed_runs, set_table
-from stario.fusion.paper_table.training import ReaderConfig, run_recipe
+from stario.fusion.paper_table.table import set_table
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import ModelRow
 from stario.sequences import ConfigError, InputError, WeightsError, read_recording, write_csv
@@ -55,7 +56,7 @@ def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4
 
 @pytest.mark.usefixtures("narrow_network")
 def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
+    monkeypatch.setattr(runs_module, "_EPOCH_STEPS", 2)
     whole, killed = run(dataset), run(dataset)
     complete_run(whole, tmp_path / "whole", reading)
     with monkeypatch.context() as during:
@@ -63,7 +64,7 @@ def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_pat
         def kill(path, seconds):
             raise KeyboardInterrupt
 
-        during.setattr(training, "write_json", kill)
+        during.setattr(runs_module, "write_json", kill)
         with pytest.raises(KeyboardInterrupt):
             complete_run(killed, tmp_path / "killed", reading)
     folder = killed.folder(tmp_path / "killed")
@@ -112,7 +113,7 @@ def test_only_new_networks_and_seeds_are_trained(dataset, reading, tmp_path, mon
     assert trained == ["StarIO 0", "StarIO without MSGCU 0", "StarIO 1"]
     assert errors.stat().st_mtime_ns == written
     table = set_table(dataset, completed_runs(more, tmp_path)["own"], {})
-    pdr, other, ours = table.as_dict()["rows"]
+    pdr, other, ours = table.rows.to_dict("records")
     assert (pdr["network"], other["network"]) == ("pdr", "StarIO without MSGCU")
     ate = values(table.scores, "ate_m", network="StarIO", track=TRUE_ATTITUDE)
     assert ours["ate"] == pytest.approx(ate.mean())

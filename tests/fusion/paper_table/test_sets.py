@@ -12,11 +12,12 @@ import pytest
 from recorded import DATA
 
 from stario.fusion.evaluation.scores import joined, scored
-from stario.fusion.paper_table import sets, training
+from stario.fusion.paper_table import runs as runs_module
+from stario.fusion.paper_table import sets
 from stario.fusion.paper_table.figures import pde_boxes
+from stario.fusion.paper_table.runs import ReaderConfig, run_recipe, train_run
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, folder_set
 from stario.fusion.paper_table.table import COLUMNS, set_table, table_text, work_of
-from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
 from stario.network.runtime.survey import ModelRow
 from stario.network.training import splits
 from stario.network.training.config import TrainingConfig
@@ -184,7 +185,7 @@ def train(monkeypatch, dataset, tmp_path):
         return train_run(dataset, recipe, tmp_path, reading), *given
 
     given: list[Any] = []
-    monkeypatch.setattr(training, "train", logged)
+    monkeypatch.setattr(runs_module, "train", logged)
     return run
 
 
@@ -208,5 +209,5 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(train, monkeyp
         track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
         return replace(walk, truth=None, positions=track)
 
-    monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
+    monkeypatch.setattr(runs_module, "cached_walks", lambda *arguments, **rest: [])
     assert [train(read)[2].simulated for read in (waypoints, read_recording)] == [True, False]
