@@ -112,7 +112,7 @@ def test_a_recordings_track_ends_there_and_its_health_states_why(make_walk, stil
     assert line.startswith("! ")
     assert "Split" in line
     (problem,) = [p for p in told(walk) if "clock" in p]
-    assert f"{by - 0.01:.3g} s at 8.0 s" in problem
+    assert f"{by - 0.01:.4g} s at 8.0 s" in problem
 
 
 def test_late_samples_and_bursts_are_not_another_clock():
