@@ -51,9 +51,9 @@ _SUDDEN = 0.45
 _LONGEST_DOUBT = 3.0
 """Time [s] after which it must be known."""
 
-_NO_DOOR, _STILL_MOVING = 1.2, 0.2
-"""Change [m] that is a lift's and no door's, if the last half second has still moved by so much
-[m]."""
+_NO_DOOR, _STILL_MOVING = 1.2, 0.1
+"""Change [m] that is a lift's and no door's, if each of the last three half seconds has moved by
+this share of it: a step falls into two averages at most."""
 
 _CLEAR_STEP = 0.4
 """Squared residuals about a step, relative to those about the line, below which the air has
@@ -211,8 +211,9 @@ class HeightBuffer(TimedBuffer[float]):
         return abs(line.slope) > least and line.step_ratio > 1.0
 
     def _is_lift(self, change: float) -> bool:
-        (_, before), (_, now) = self._past[-2], self._past[-1]
-        return abs(change) > _NO_DOOR and (now - before) * change > _STILL_MOVING * abs(change)
+        last = np.array([height for _, height in self._past])[-_MIN_POINTS:]
+        moved = np.diff(last) * math.copysign(1.0, change)
+        return abs(change) > _NO_DOOR and bool(moved.min() > _STILL_MOVING * abs(change))
 
     def _learn(self, scatter: float) -> None:
         self._count = min(self._count + 1, _SCATTER_COUNT)

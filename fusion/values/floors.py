@@ -25,9 +25,6 @@ _OVER = 4
 _LEAST = 0.8
 """Least change of height [m]: a few steps."""
 
-_SUDDEN = 0.85
-"""Share of a change within two seconds that is the pressure's of a door: a lift takes longer."""
-
 _LANDING_SECONDS = 4.0
 """A shorter stay between two changes of one direction is a landing [s]; longer ones are landings if
 their height fits no floor."""
@@ -143,13 +140,7 @@ def _changes(h: FloatArray) -> list[_Change]:
         if runs and start - runs[-1].stop < _LANDING_SECONDS and runs[-1].climb * sign[start] > 0.0:
             start = runs.pop().start
         runs.append(_change(start, min(stop, len(h) - 1), h))
-    two_seconds = np.abs(h[2:] - h[:-2])
-    most = [float(two_seconds[max(0, run.start - 1) : run.stop].max()) for run in runs]
-    return [
-        run
-        for run, sudden in zip(runs, most, strict=True)
-        if abs(run.climb) > max(_LEAST, sudden / _SUDDEN)
-    ]
+    return [run for run in runs if abs(run.climb) > _LEAST]
 
 
 def _change(start: int, stop: int, h: FloatArray) -> _Change:

@@ -60,9 +60,10 @@ def test_a_level_floor_is_no_climb():
         assert all(each is not None and each.rate == each.stepped == 0.0 for each in found)
 
 
-@pytest.mark.parametrize("step", [0.6, -0.9])
-def test_a_door_is_held_back_and_then_a_step_of_the_air(step):
-    heights = np.where(np.arange(240) < 100, 0.0, step)
+@pytest.mark.parametrize("step", [0.6, -0.9, 2.5, -3.8])
+@pytest.mark.parametrize("begin", [99, 101])
+def test_a_door_is_held_back_and_then_a_step_of_the_air(step, begin):
+    heights = np.where(np.arange(240) < begin, 0.0, step)
     found = judged(heights)
     assert [each for each in found if each is not None and each.rate] == []
     assert any(each is None for each in found)

@@ -127,16 +127,6 @@ def test_landings_are_no_floors():
         assert [(c.before, c.after) for c in changes] == [(0, 1)]
 
 
-@pytest.mark.parametrize("rise", [-2.5, 3.8, 6.0])
-def test_a_pressure_that_steps_at_a_door_is_no_way_to_a_floor(rise):
-    assert found((30, 0, 1.2), (1, rise, 1.2), (30, 0, 1.2)) == ([], 0.0)
-    for seconds, speed, how in ((8, 0.5, "stairs"), (3.6, 0.0, "lift")):
-        changes, _ = found(
-            (30, 0, 1.2), (1, rise, 1.2), (30, 0, 1.2), (seconds, 3.0, speed), (30, 0, 1.2)
-        )
-        assert [(c.before, c.after, c.how) for c in changes] == [(0, 1, how)]
-
-
 def test_a_level_walk_a_ramp_a_doorstep_and_two_seconds_are_one_floor():
     doorstep = [(30, 0, 1.2), (3, 0.6, 1.0), (30, 0, 1.2)]
     for legs in ([(300, 0.0, 1.2)], [(60, 2.0, 1.2)], doorstep, [(2, 0, 1.0)]):
