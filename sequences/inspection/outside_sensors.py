@@ -114,7 +114,7 @@ def _pressure_findings(figures: Mapping[str, Any]) -> list[Finding]:
         found.append(Finding("pressure_noise", text, level="note", values={"noise_m": noise}))
     if rate < _SLOW_HZ or held > _HELD_SHARE:
         text = (
-            f"barometer: {rate:.2g} samples per second, of which {held:.0%} repeat the last: "
+            f"barometer: {rate:.3g} samples per second, of which {held:.0%} repeat the last: "
             "lifts and stairs are seen late"
         )
         values = {"rate_hz": rate, "repeated_share": held}
