@@ -25,6 +25,7 @@ from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity
+from stario.fusion.imu.barometer import UNKNOWN_RATE
 from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
@@ -239,7 +240,7 @@ def _with_height(s: EstimatorState, interval: ImuInterval) -> EstimatorState:
     """Update with the height by the pressure, and note whether it climbs."""
     sample = interval.height
     if sample is None:
-        return changed(s, climb_rate=height.UNKNOWN_RATE) if height.silent(s.ekf) else s
+        return changed(s, climb_rate=UNKNOWN_RATE) if height.silent(s.ekf) else s
     after, result = height.with_height(s.ekf, sample)
     if s.alternative is not None:
         other, _ = height.with_height(s.alternative.ekf, sample)

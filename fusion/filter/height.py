@@ -45,10 +45,6 @@ STAIRS_SLOPE = 0.6
 _PATH, _STAIRS = 0.08, 0.2
 """Slopes by the network's speed up to which one is on a path, and from which on stairs."""
 
-UNKNOWN_RATE = 1e-3
-"""Vertical speed that stands for one that is not known [m/s], as where the pressure is silent or
-shows only how high a climb was: the height yields, the length does not."""
-
 WALKING = 0.4
 """Speed by the network [m/s] above which one walks on stairs, below which one stands in a lift."""
 

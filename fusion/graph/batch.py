@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, frame_rotation
-from stario.fusion.filter.height import UNKNOWN_RATE
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias, SamePlace
-from stario.fusion.imu.barometer import CLIMB_DELAY
+from stario.fusion.imu.barometer import CLIMB_DELAY, UNKNOWN_RATE
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.lie import UNKNOWN_YAW
@@ -106,7 +105,7 @@ def _with_climbs(records: Sequence[Record]) -> list[Record]:
         return list(records)
     time, height = np.array([(s.time, s.height) for s in samples]).T
     stop = np.array([r.interval.stop for r in records])
-    climbs = np.array([bool(r.climb_rate) for r in records])
+    climbs = np.array([r.climb_rate not in (None, 0.0, UNKNOWN_RATE) for r in records])
     for sample in samples:
         if sample.risen:
             climbs |= (stop > sample.time - CLIMB_DELAY) & (stop <= sample.time)

@@ -42,6 +42,10 @@ _MIN_POINTS = 4
 _CLIMB_SIGMAS = 3.0
 """Sigmas of the line's slope from which it means a climb."""
 
+UNKNOWN_RATE = 1e-3
+"""Vertical speed that stands for one that is not known [m/s], as where there is no pressure for
+seconds: heights yield, lengths do not."""
+
 _STILL_CLIMBING = 0.1
 """Vertical speed below which a climb has ended [m/s]."""
 
@@ -59,10 +63,12 @@ _CLEAR_STEP = 0.4
 """Squared residuals about a step, relative to those about the line, below which the air has
 stepped: a door, a ventilator. Whoever climbs slowly must not be mistaken for one."""
 
-_MAX_REPEATED, _COARSE = 3.0, 0.03
-"""Time for which a pressure may repeat itself [s], three samples of the slowest phones (real ones:
-at most 2.1 s), and resolution [hPa] from which on a sensor's noise may hide in one step, so that
-repeating says nothing. A finer sensor, or one that has never changed, has then stopped."""
+_RESOLUTIONS = (1.0, 0.1, 0.01)
+"""Steps in which pressures are rounded [hPa]: 8 m, 0.8 m and 8 cm of height."""
+
+_MAX_REPEATED, _REPEATED_PER_STEP, _MANY = 3.0, 1000.0, 4
+"""Time for which that many equal pressures may come in a row [s], and per step of a rounded one
+[s/hPa]: real ones repeat for at most 2.1 s, and the coarser, the longer the air takes to a step."""
 
 _FIRST_SCATTER, _MIN_SCATTER = 0.1, 0.02
 """Scatter of averaged heights about their line [m]: assumed at first, and the least."""
@@ -82,7 +88,8 @@ class HeightSample(NamedTuple):
         time: mean time of the averaged samples [s].
         height: [m].
         sigma: standard deviation of its noise [m].
-        rate: vertical speed while it climbs or descends [m/s]; 0 on a floor.
+        rate: vertical speed while it climbs or descends [m/s]; 0 on a floor, `UNKNOWN_RATE` if
+            there are too few or too coarse heights to tell.
         risen: change [m] that was not known to be a climb before; 0 otherwise.
         stepped: step of the air's pressure since the last height [m]; 0 without one.
     """
@@ -116,10 +123,10 @@ class HeightBuffer(TimedBuffer[float]):
         self._variance, self._count = _FIRST_SCATTER**2, 0
         self._doubt: tuple[float, float] | None = None  # time and height before a sudden change
         self._climbing = False
-        self._pressure, self._since, self._step = math.nan, math.inf, math.inf
-        self._heard = math.nan
-        self.silence = (0.0, 0.0)
-        """Start and length [s] of the longest time without a usable pressure."""
+        self._pressure, self._since, self._equal = math.nan, math.nan, 0
+        self._resolution = 0  # index; beyond the last one it is finer than those
+        self._averages = 0  # equal ones in a row
+        self._heard, self._silence = math.nan, (0.0, 0.0)
 
     def add(self, time: float, pressure_hPa: float, now: float) -> bool:
         """Add a pressure [hPa]; return False if it, its time or its sensor cannot be right.
@@ -130,13 +137,18 @@ class HeightBuffer(TimedBuffer[float]):
         if not (low <= pressure_hPa <= high and self.fits(time, now)):
             return False
         if pressure_hPa != self._pressure:
-            if math.isnan(self._heard):
-                self._heard = time
-            else:
-                self._step = min(self._step, abs(pressure_hPa - self._pressure))
-            self._pressure, self._since = pressure_hPa, time
-        held = not self._rounding and time - self._since > _MAX_REPEATED
+            self._pressure, self._since, self._equal = pressure_hPa, time, 0
+            while self._step and abs(math.remainder(pressure_hPa, self._step)) > 1e-6:
+                self._resolution += 1
+        self._equal += 1
+        longest = max(_MAX_REPEATED, _REPEATED_PER_STEP * self._step)
+        held = self._equal >= _MANY and time - self._since > longest
         return not held and self.keep(time, pressure_hPa)
+
+    @property
+    def silence(self) -> tuple[float, float]:
+        """Start and length [s] of the longest time without a usable pressure, if there are any."""
+        return self._silence if self._equal else (0.0, 0.0)
 
     def at(self, stop: float) -> HeightSample | None:
         """Return the height of the half second before a time [s]; None if there is none to be used.
@@ -147,8 +159,9 @@ class HeightBuffer(TimedBuffer[float]):
         while self._waiting and self._waiting[0][0] <= stop:
             taken.append(self._waiting.popleft())
         taken = [each for each in taken if each[0] > stop - HEIGHT_SECONDS]
-        if not taken or math.isinf(self._step):  # how finely it measures is not known yet
-            self.silence = max(self.silence, (self._heard, stop - self._heard), key=itemgetter(1))
+        if not taken:
+            self._heard = stop if math.isnan(self._heard) else self._heard
+            self._silence = max(self._silence, (self._heard, stop - self._heard), key=itemgetter(1))
             return None
         self._heard = stop
         times, pressures = np.array(taken).T
@@ -156,6 +169,8 @@ class HeightBuffer(TimedBuffer[float]):
         if math.isnan(self._first):
             self._first = altitude
         height = altitude - self._first
+        same = bool(self._past) and height == self._past[-1][1]
+        self._averages = self._averages + 1 if same else 1
         if self._past:
             before, from_height = self._past[-1]
             if abs(height - from_height) > FASTEST_LIFT * (time - before):
@@ -173,7 +188,8 @@ class HeightBuffer(TimedBuffer[float]):
             self._is_climb(line, climbed) or self._is_lift(height - usual)
         )
         self._doubt = None
-        sample = HeightSample(time, height, self._sigma)
+        known = line is not None and self._rounding < _NO_DOOR
+        sample = HeightSample(time, height, self._sigma, 0.0 if known else UNKNOWN_RATE)
         if line is not None and self._climbing:
             risen = 0.0 if climbed else height - (doubt or began)[1]
             return sample._replace(rate=line.slope, risen=risen)
@@ -191,22 +207,28 @@ class HeightBuffer(TimedBuffer[float]):
         return sample
 
     @property
+    def _step(self) -> float:
+        """Step in which all pressures so far are rounded [hPa]; 0 for a fine one."""
+        return (*_RESOLUTIONS, 0.0)[self._resolution]
+
+    @property
     def _rounding(self) -> float:
-        """Resolution of a coarse sensor as a height [m]; 0 for others."""
-        if not _COARSE < self._step < math.inf:
-            return 0.0
+        """That step as a height [m]."""
         ends = np.array([self._pressure - self._step, self._pressure])
         return float(-np.diff(pressure_altitude(ends))[0])
 
     @property
     def _sigma(self) -> float:
-        return math.sqrt(_CORRELATION * self._variance + self._rounding**2 / 12.0)
+        # n equal averages share one error of rounding: sum of 1 / (k (k + 1)) up to n is below 1.
+        rounded = self._rounding**2 / 12.0 * self._averages * (self._averages + 1)
+        return math.sqrt(_CORRELATION * self._variance + rounded)
 
     def _is_climb(self, line: _Line, climbed: bool) -> bool:
         if climbed:
             return abs(line.slope) > _STILL_CLIMBING
         # Over n heights at equal steps the slope's sigma is the mean's times sqrt(12) / span.
-        sigma = math.sqrt(12.0 / len(self._past)) * self._sigma / CLIMB_DELAY
+        variance = _CORRELATION * self._variance + self._rounding**2 / 12.0
+        sigma = math.sqrt(12.0 * variance / len(self._past)) / CLIMB_DELAY
         least = max(MIN_CLIMB_RATE, _CLIMB_SIGMAS * sigma)
         return abs(line.slope) > least and line.step_ratio > 1.0
 

@@ -257,8 +257,10 @@ def _field(health: Health) -> Iterator[Finding]:
         yield _found("field_useless", text, values=health.bearings)
     if apart := health.north_contradiction:
         degrees = math.degrees(apart)
-        text = f"Magnetic north and the fixes' directions contradict each other by {degrees:.0f} "
-        text += "degrees; the track keeps to the fixes."
+        text = (
+            "Magnetic north and the direction by fixes or the known start contradict each other by "
+            f"{degrees:.0f} degrees; the track keeps to the latter."
+        )
         advice = (
             "Check both: a declination is positive to the east, a yaw is measured in the map from "
             "the x axis (east) towards the y axis (north)."

@@ -112,7 +112,13 @@ def _pressure_findings(figures: Mapping[str, Any]) -> list[Finding]:
     if noise > _NOISY_M:
         text = f"barometer: a noise of {noise:.1f} m, as of wind or in a tight pocket"
         found.append(Finding("pressure_noise", text, level="note", values={"noise_m": noise}))
-    if rate < _SLOW_HZ or held > _HELD_SHARE:
+    if held == 1.0:
+        text = (
+            "barometer: all pressures are equal: it has stopped, or is rounded to metres of height"
+        )
+        fix = "log it with two decimals of hPa; the height of this track is the network's"
+        found.append(Finding("pressure_constant", text, fix, values={"pressure": value}))
+    elif rate < _SLOW_HZ or held > _HELD_SHARE:
         text = (
             f"barometer: {rate:.3g} samples per second, of which {held:.0%} repeat the last: "
             "lifts and stairs are seen late"

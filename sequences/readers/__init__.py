@@ -201,7 +201,7 @@ def find_recordings(
 def _warn_of_copies(found: list[Path]) -> None:
     """Say which files are copies, `walk (1).csv`: counted twice, a recording weighs twice."""
     by_size: dict[int, list[Path]] = {}
-    for path in filter(Path.is_file, found):
+    for path in sorted(filter(Path.is_file, found), key=lambda path: (len(path.name), path)):
         alike = by_size.setdefault(path.stat().st_size, [])
         if original := next((one for one in alike if cmp(one, path, shallow=False)), None):
             _log.warning("%s: the same recording as %s: remove one", path, original)

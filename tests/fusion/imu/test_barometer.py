@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stario.fusion.imu.barometer import HeightBuffer, HeightSample
+from stario.fusion.imu.barometer import UNKNOWN_RATE, HeightBuffer, HeightSample
 from stario.sequences.units import pressure_altitude, standard_pressure
 
 RATE = 8.0
@@ -18,7 +18,9 @@ def judged(heights: np.ndarray, noise: float = 0.05, seed: int = 0) -> list[Heig
         assert buffer.add(k / RATE, float(pressure), k / RATE)
         if k % 4 == 3:
             found.append(buffer.at(k / RATE))
-    return found
+    # Less than four heights say nothing about climbs.
+    assert [each.rate for each in found[:3]] == [UNKNOWN_RATE] * 3
+    return [*(each._replace(rate=0.0) for each in found[:3]), *found[3:]]
 
 
 def ramp(rate: float, begin: float = 10.0, end: float = 22.0, until: float = 32.0) -> np.ndarray:
@@ -116,31 +118,41 @@ def test_what_rises_faster_than_any_lift_is_no_height():
     assert found[-1].height == pytest.approx(60.0, abs=1.0)
 
 
-def test_a_sensor_that_has_stopped_tells_nothing():
-    rng = np.random.default_rng(0)
-    noisy = standard_pressure(0.05 * rng.standard_normal(400))
-    stuck = np.where(np.arange(400) < 160, noisy, noisy[160])
-    for pressures, start, height_count in ((stuck, 20.0, 48), (np.full(400, 1000.0), 0.0, 0)):
-        buffer, found = HeightBuffer(), []
-        for k, pressure in enumerate(pressures):
-            buffer.add(k / RATE, float(pressure), k / RATE)
-            if k % 4 == 3:
-                found.append(buffer.at(k / RATE))
-        known = [each for each in found if each is not None]
-        assert len(known) <= height_count
-        assert sum(buffer.silence) == pytest.approx(50.0, abs=0.2)
-        assert start <= buffer.silence[0] < start + 4.0
-
-
-def test_a_coarse_sensor_knows_heights_to_its_resolution():
-    """A tenth of a hectopascal is 0.84 m; that it repeats does not mean that it has stopped."""
+def logged(pressures: np.ndarray) -> tuple[HeightBuffer, list[HeightSample]]:
+    """Return the buffer that these pressures [hPa] have passed, `RATE` per second, and heights."""
     buffer, found = HeightBuffer(), []
-    for k, height in enumerate(ramp(0.25)):
-        pressure = round(float(standard_pressure(np.array(300.3 + height))), 1)
-        # Before the first change it could be any sensor that has stopped.
-        assert buffer.add(k / RATE, pressure, k / RATE) or k < 12.0 * RATE
+    for k, pressure in enumerate(pressures):
+        buffer.add(k / RATE, float(pressure), k / RATE)
         if k % 4 == 3:
             found.append(buffer.at(k / RATE))
-    last = [each for each in found if each is not None][-1]
-    assert 0.84 / np.sqrt(12.0) < last.sigma < 0.84
-    assert all(each is None or each.stepped == 0.0 for each in found)
+    return buffer, [each for each in found if each is not None]
+
+
+@pytest.mark.parametrize(("decimals", "longest"), [(4, 3.0), (2, 10.0)])
+def test_a_sensor_that_has_stopped_tells_nothing(decimals, longest):
+    noise = 0.05 * np.random.default_rng(0).standard_normal(400)
+    pressures = standard_pressure(300.0 + noise).round(decimals)
+    stuck = np.where(np.arange(400) < 160, pressures, pressures[160])
+    buffer, found = logged(stuck)
+    assert found[-1].time == pytest.approx(20.0 + longest, abs=0.5)
+    assert buffer.silence == pytest.approx((20.0 + longest, 30.0 - longest), abs=0.7)
+    # A slow sensor may measure the same twice.
+    slow = HeightBuffer()
+    assert all(slow.add(5.0 * k, 1000.0004 + 0.001 * (k // 2), 5.0 * k) for k in range(20))
+
+
+@pytest.mark.parametrize("decimals", [0, 1])
+def test_a_coarse_sensor_knows_heights_to_its_resolution(decimals):
+    """A tenth of a hectopascal is 0.87 m; that it repeats does not mean that it has stopped."""
+    pressures = standard_pressure(300.3 + ramp(0.25)).round(decimals)
+    buffer, found = logged(pressures)
+    assert len(found) >= len(pressures) // 4 - 1  # eight metres at once are faster than a lift
+    assert buffer.silence[1] < 1.0
+    first, *_, last = found
+    rounding = 8.7 * 10.0**-decimals / np.sqrt(12.0)
+    assert first.sigma > rounding
+    assert all(each.stepped == 0.0 for each in found)
+    # Eight metres do not tell whether one climbs; equal heights are one measurement, not many.
+    assert (last.rate == UNKNOWN_RATE) == (decimals == 0)
+    level = [each.sigma for each in found[: 2 * 8] if each.height == first.height]
+    assert np.sum(np.square(rounding / np.array(level))) < 1.1

@@ -46,6 +46,13 @@ def test_a_house_is_inspected_in_a_line_for_each_sensor(house):
     assert told_as_data["satellites"]["stale"][0]["length_s"] > 40.0
 
 
+def test_a_barometer_that_never_changes_is_a_warning(house):
+    air = house.barometer
+    constant = Barometer(air.time, np.full(len(air), 1000.0))
+    [finding] = assess_barometer(constant).findings
+    assert (finding.code, finding.level) == ("pressure_constant", "warning")
+
+
 @pytest.mark.parametrize("noise", [0.05, 0.2])
 def test_noise_is_measured_on_stairs_as_well(noise):
     stairs = climbing(np.cumsum(np.full(600, 0.035)))
