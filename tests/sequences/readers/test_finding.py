@@ -61,5 +61,5 @@ def test_a_copy_of_a_recording_is_named(walk, tmp_path, caplog):
     assert len(find_recordings(tmp_path)) == 3
     [told] = [record.getMessage() for record in caplog.records]
     assert told == (
-        f"{tmp_path / 'walk.csv'}: the same recording as {tmp_path / 'walk (1).csv'}: remove one"
+        f"{tmp_path / 'walk (1).csv'}: the same recording as {tmp_path / 'walk.csv'}: remove one"
     )
