@@ -137,8 +137,8 @@ class EstimatorState:
         if not self.map_frame.yaw_known:
             health.notes.append("north could not be determined: the track starts with yaw zero")
         else:
-            known = self.ekf, self.magnetic.count, f.declination
-            health.north_contradiction = north_contradiction(*known)
+            apart = north_contradiction(self.ekf, self.magnetic, f.declination)
+            health.north_contradiction = apart
         return health
 
 

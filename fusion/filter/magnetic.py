@@ -197,25 +197,29 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
         return None
     c, P = s.field_row, s.P_reported
     variance = P[2, 2] + P[c, c] - 2.0 * P[2, c]
-    turn = math.pi / 2.0 - declination - s.field.azimuth
+    turn = _turn_to_north(s.field, declination)
     sigma = math.sqrt(max(variance, 0.0) + NORTH_SIGMA**2)
     return yaw_fix(s.time, math.remainder(yaw + turn, 2.0 * math.pi), sigma)
 
 
-def north_contradiction(s: EkfState, count: int, declination: float) -> float:
+def _turn_to_north(field: FieldState, declination: float) -> float:
+    return math.pi / 2.0 - declination - field.azimuth
+
+
+def north_contradiction(s: EkfState, reference: MagneticReference, declination: float) -> float:
     """Return the angle from magnetic north to the north of a track that is oriented [rad].
 
     Args:
         s: the filter's state.
-        count: number of bearings so far.
+        reference: usual properties of the field.
         declination: angle from true to magnetic north, positive east [rad].
 
     Returns:
         0 if both agree within three sigma, or if magnetic north is not known.
     """
-    if s.field is None or count < _MIN_NORTH_COUNT:
+    if s.field is None or reference.count < _MIN_NORTH_COUNT:
         return 0.0
-    apart = math.remainder(s.field.azimuth - (math.pi / 2.0 - declination), 2.0 * math.pi)
+    apart = math.remainder(-_turn_to_north(s.field, declination), 2.0 * math.pi)
     variance = s.P_reported[s.field_row, s.field_row] + NORTH_SIGMA**2
     return apart if apart**2 > 9.0 * variance else 0.0
 

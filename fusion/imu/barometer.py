@@ -66,6 +66,10 @@ stepped: a door, a ventilator. Whoever climbs slowly must not be mistaken for on
 _RESOLUTIONS = (1.0, 0.1, 0.01)
 """Steps in which pressures are rounded [hPa]: 8 m, 0.8 m and 8 cm of height."""
 
+_EXACT = 1e-4
+"""Distance from a multiple within which a pressure is one [hPa]: phones log floats of 32 bits,
+which are exact to 3e-5."""
+
 _MAX_REPEATED, _REPEATED_PER_STEP, _MANY = 3.0, 1000.0, 4
 """Time for which that many equal pressures may come in a row [s], and per step of a rounded one
 [s/hPa]: real ones repeat for at most 2.1 s, and the coarser, the longer the air takes to a step."""
@@ -138,7 +142,7 @@ class HeightBuffer(TimedBuffer[float]):
             return False
         if pressure_hPa != self._pressure:
             self._pressure, self._since, self._equal = pressure_hPa, time, 0
-            while self._step and abs(math.remainder(pressure_hPa, self._step)) > 1e-6:
+            while self._step and abs(math.remainder(pressure_hPa, self._step)) > _EXACT:
                 self._resolution += 1
         self._equal += 1
         longest = max(_MAX_REPEATED, _REPEATED_PER_STEP * self._step)

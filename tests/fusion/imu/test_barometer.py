@@ -141,10 +141,11 @@ def test_a_sensor_that_has_stopped_tells_nothing(decimals, longest):
     assert all(slow.add(5.0 * k, 1000.0004 + 0.001 * (k // 2), 5.0 * k) for k in range(20))
 
 
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
 @pytest.mark.parametrize("decimals", [0, 1])
-def test_a_coarse_sensor_knows_heights_to_its_resolution(decimals):
+def test_a_coarse_sensor_knows_heights_to_its_resolution(decimals, precision):
     """A tenth of a hectopascal is 0.87 m; that it repeats does not mean that it has stopped."""
-    pressures = standard_pressure(300.3 + ramp(0.25)).round(decimals)
+    pressures = standard_pressure(300.3 + ramp(0.25)).round(decimals).astype(precision)
     buffer, found = logged(pressures)
     assert len(found) >= len(pressures) // 4 - 1  # eight metres at once are faster than a lift
     assert buffer.silence[1] < 1.0
