@@ -15,8 +15,10 @@ from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     is_time,
     is_uncalibrated,
+    quaternion_of,
     sensor_of,
     time_unit_of,
+    unit_of,
 )
 from stario.sequences.readers.text import Column, first_lines
 from stario.sequences.units import (
@@ -165,7 +167,7 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     ignored = []
     for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
         title, unit = _cell(text)
-        unit = unit_named(unit) or (time_unit_of(title) if name == "t" else "")
+        unit = unit_named(unit) or (time_unit_of(title) if name == "t" else unit_of(title))
         if not name or (name in RARE and name in columns):
             ignored.append(title)
         elif name in RARE and unit not in RARE_UNITS[name]:
@@ -251,13 +253,29 @@ def _names(titles: list[str]) -> list[str]:
     names = [_name(title.lower()) for title in plain]
     if clocks and "t" not in names:  # `time_ms`, `seconds_elapsed`
         names[clocks[0]] = "t"
+    if set(POSITION[:2]) <= set(names):  # truth, however the other titles are spelled
+        for k, title in enumerate(plain):
+            if not names[k] and (spelled := _spelled(title)) not in names:
+                names[k] = spelled
     return names
 
 
 def _name(title: str) -> str:
-    """Return the canonical name of a title; a magnetometer's may be spelled as phones do."""
+    """Return the canonical name of a title; positions and magnetometers may be spelled freely.
+
+    With freely spelled gyroscopes and accelerometers a file is a logger's, unless it has truth.
+    """
     loose = _ALIASES.get(re.sub(r"[ .]", "_", re.sub(r"^imu\(\d+\):", "", title)), "")
-    return _ALIASES.get(title) or (loose if loose in MAGNETIC else "")
+    return _ALIASES.get(title) or (loose if loose in (*MAGNETIC, *POSITION) else "")
+
+
+def _spelled(title: str) -> str:
+    """Return the canonical name that the words of a title tell, `gx` for `Gyroscope X`."""
+    if part := quaternion_of(title):
+        return f"q{part}"
+    axis, words = axis_of(title) or ("", ())
+    letter = {"gyro": "g", "accel": "a"}.get(sensor_of(words) or "", "")
+    return letter + axis if letter and not is_uncalibrated(words) else ""
 
 
 def _titles(line: str) -> list[str]:

@@ -97,8 +97,8 @@ def read_wide(path: Path) -> ImuSequence:
 def is_wide(path: Path) -> bool:
     """Return whether a file's header names a clock and the axes of both sensors.
 
-    A generic CSV counts only if it holds no ground truth, and poses lie next to it or it has what
-    that format lacks: two kinds of force (gFx and ax, or gravity apart) or the device's attitude.
+    One with positions is a generic CSV, of which others count only if poses lie next to it or it
+    has what that format lacks: two kinds of force (gFx and ax, or gravity apart) or an attitude.
     """
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         return False
@@ -106,7 +106,7 @@ def is_wide(path: Path) -> bool:
     if files is None:
         return False
     named = named_columns(path)
-    if named >= {"t", *IMU} and named & set(POSITION):
+    if named & set(IMU) and named & set(POSITION):
         return False
     if not named >= {"t", *IMU} or _wide_poses(path, files):
         return True
