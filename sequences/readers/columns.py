@@ -98,6 +98,9 @@ _QUOTES = " \"'"
 _HEAD_LINES = 200
 """Number of lines within which the header must be for a file to be recognised."""
 
+_CLOCK_ROWS = 1000
+"""Number of rows that show which of several clocks is the finest."""
+
 _FEWEST_UNITS = 3
 """Number of cells that make a row of units: those of one sensor."""
 
@@ -126,8 +129,21 @@ def read_header(path: Path, lines: list[str]) -> Header:
         raise ReadError(path, f"line {number}", found, f"titles, {HEADER}", fix)
     titles, below = _titles(line), lines[number] if number < len(lines) else ""
     with_units = with_units_below(titles, below.split(_separator(line)))
-    columns = _columns(path, number, with_units or titles)
-    return Header(number + (with_units is not None), _separator(line), titles, columns)
+    start = number + (with_units is not None)
+    rows = [row.split(_separator(line)) for row in lines[start : start + _CLOCK_ROWS]]
+    columns = _columns(path, number, _with_finest_clock(path, with_units or titles, rows))
+    return Header(start, _separator(line), titles, columns)
+
+
+def _with_finest_clock(path: Path, titles: list[str], rows: list[list[str]]) -> list[str]:
+    """Return titles without those of further clocks, `t` beside `timestamp`, that repeat more."""
+    clocks = [k for k, name in enumerate(_names(titles)) if name == "t"]
+    if len(clocks) < 2:
+        return titles
+    used = max(clocks, key=lambda k: len({cell for row in rows for cell in row[k : k + 1]}))
+    others = ", ".join(_cell(titles[k])[0] for k in clocks if k != used)
+    _log.info("%s: times are read from %s, not from %s", path, _cell(titles[used])[0], others)
+    return ["" if k in clocks and k != used else title for k, title in enumerate(titles)]
 
 
 def _header_index(lines: list[str]) -> int | None:
@@ -175,7 +191,8 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
             _log.warning("%s: %s is not read: found unit %r, expected %s", path, title, unit, known)
         elif name in columns:
             found = f"both {title} and {columns[name].title}"
-            raise ReadError(path, f"line {number}, {name}", found, "one column")
+            fix = "rename or remove the other"
+            raise ReadError(path, f"line {number}, {name}", found, "one column", fix)
         else:
             columns[name] = Column(index, title, unit)
     placed, posed = (bool(set(names) & set(columns)) for names in (POSITION, QUAT))

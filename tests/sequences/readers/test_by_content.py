@@ -9,6 +9,7 @@ from stario.sequences import ReadError, read_recording, write_csv
 CLOCKS = {
     **{"t [s]": 1, "time_s": 1, "seconds_elapsed": 1, "timestamp [ms]": 1e3},
     **{"t_ms": 1e3, "time_ms": 1e3, "timestamp_ms": 1e3, "timestamp_ns": 1e9},
+    **{"ts": 1, "ts_ms": 1e3},
 }
 
 
@@ -47,6 +48,41 @@ def test_any_title_of_a_clock_gives_the_same_recording(clock, placed, walk, tmp_
     np.testing.assert_allclose(read.time, walk.time, atol=1e-9)
     assert (read.truth is not None) == placed
     assert (read.device_attitude is not None) != placed
+
+
+@pytest.mark.parametrize("coarse", ["timestamp", "time [ms]"])
+def test_of_two_clocks_the_finer_is_read(coarse, walk, tmp_path):
+    write_csv(tmp_path / "walk.csv", walk)
+    header, *rows = (tmp_path / "walk.csv").read_text().splitlines()
+    rows = [f"{1e6 + k // 10:g},{row}" for k, row in enumerate(rows)]
+    read = read_recording(write_lines(tmp_path / "walk.csv", f"{coarse},{header}", *rows))
+    assert np.array_equal(read.time, walk.time)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "truth"),
+    [
+        ("Gyroscope ?,Accelerometer ?", "p?,q?"),
+        ("Gyro_? [rad/s],Acc ?", "Position ?,Quaternion ?"),
+        ("gyro_rad/s_?,Acceleration ? (m/s²)", "pos.?,Orientation ?"),
+    ],
+)
+@pytest.mark.parametrize("posed", [True, False], ids=["poses", "positions"])
+def test_a_file_with_positions_has_truth_however_its_sensors_are_spelled(
+    sensors, truth, posed, walk, tmp_path
+):
+    write_csv(tmp_path / "walk.csv", walk)
+    _, *rows = (tmp_path / "walk.csv").read_text().splitlines()
+    spelled = f"{sensors},{truth}".split(",")[: 4 if posed else 3]
+    axes = [title.replace("?", axis) for title in spelled for axis in "XYZ"]
+    titles = ",".join(["t [s]", *axes, *([spelled[-1].replace("?", "W")] if posed else [])])
+    kept = titles.count(",") + 1
+    lines = [",".join(row.split(",")[:kept]) for row in rows]
+    read = read_recording(write_lines(tmp_path / "walk.csv", titles, *lines))
+    assert np.array_equal(read.gyro, walk.gyro)
+    assert np.array_equal(read.accel, walk.accel)
+    track = read.truth if posed else read.positions
+    assert np.array_equal(track.position_W, walk.truth.position_W)
 
 
 @pytest.mark.parametrize("names", ["gx gy gz ax ay az", "gyro_x gyro_y gyro_z acc_x acc_y acc_z"])
