@@ -114,9 +114,10 @@ class Navigator:
     def push_pressure(self, time: float, hPa: float) -> None:
         """Process one pressure of a stream's barometer, before the IMU samples that follow it.
 
-        It tells changes of the height, on stairs and in lifts as well (`filter.height`). Pressures
-        that are not finite, repeat an earlier time, or are late by more than a tenth of a second
-        are dropped and counted. The barometer is optional.
+        It tells changes of the height, on stairs and in lifts as well (`filter.height`), each half
+        second by the average of the pressures in it. Those that come later than their average do
+        not count; those more than a tenth of a second before its end are dropped and counted, as
+        are those that are not finite or repeat an earlier time. The barometer is optional.
 
         Args:
             time: [s], on the IMU's clock.
