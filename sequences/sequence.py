@@ -178,7 +178,8 @@ class ImuSequence:
         maybe_apple: whether the accelerometer may have Apple's sign, which nothing in the file
             tells: `check_units` warns of it.
         alone_s: seconds for which a sensor of the file was recorded before the other began or after
-            it ended, by its name, if that is a notable part; such samples are left out.
+            it ended, by its name, if that is a notable part; the reader has left such samples out,
+            so that files written of the recording do not tell.
 
     Raises:
         InputError: the arrays' shapes do not agree, there is no sample, time, gyro or accel holds

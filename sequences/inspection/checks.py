@@ -29,6 +29,9 @@ from stario.sequences.units import FAST_RAD_S, GYRO_UNITS
 MIN_SECONDS = 1.5
 """Shortest recording that holds a window and a margin around it [s]."""
 
+_ALONE_S = 1.0
+"""Time [s] at a recording's ends without one of the sensors that needs no mention."""
+
 _SHORTEST_S = 0.9
 _WINDOW_S = 4.0
 _WINDOWS = 12
@@ -130,16 +133,27 @@ def unit_findings(sequence: ImuSequence) -> list[Finding]:
         )
         fix = "if it is from an iPhone, pass `--accel-sign apple`"
         found.append(Finding("apple_sign_open", text, fix, level="note"))
-    if sequence.alone_s:
-        times = " and ".join(
-            f"only the {name} for {s:.1f} s" for name, s in sequence.alone_s.items()
-        )
+    if alone_s := sequence.alone_s or _alone_s(sequence):
+        times = " and ".join(f"only the {name} for {s:.1f} s" for name, s in alone_s.items())
         text = f"samples: found {times}, which are left out"
         fix = "was a file cut short, or did the app start or stop one of them alone?"
-        found.append(Finding("sensor_alone", text, fix, values=sequence.alone_s))
+        found.append(Finding("sensor_alone", text, fix, values=alone_s))
     if not sequence.source:  # a reader would have told the sign, or asked
         found += downward(accel)
     return found
+
+
+def _alone_s(sequence: ImuSequence) -> dict[str, float]:
+    """Return seconds at either end in which one sensor alone holds numbers, as files of one do."""
+    gyro, accel = (
+        np.flatnonzero(np.isfinite(x).all(axis=1)) for x in (sequence.gyro, sequence.accel)
+    )
+    counts = {
+        "gyroscope": max(accel[0] - gyro[0], 0) + max(gyro[-1] - accel[-1], 0),
+        "accelerometer": max(gyro[0] - accel[0], 0) + max(accel[-1] - gyro[-1], 0),
+    }
+    alone_s = {name: float(count) / sequence.rate for name, count in counts.items()}
+    return {name: s for name, s in alone_s.items() if s > _ALONE_S}
 
 
 def downward(accel: FloatArray) -> list[Finding]:

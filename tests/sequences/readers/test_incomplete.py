@@ -1,6 +1,7 @@
 """Folders that lack a part of their recording: the error names the part and its fault."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import published_formats as formats
@@ -13,8 +14,10 @@ from stario.sequences import (
     find_recordings,
     inspect_recording,
     read_recording,
+    write_csv,
 )
 from stario.sequences.datasets.convert import write_euroc
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.readers.columns import HEADER
 
 
@@ -129,3 +132,20 @@ def test_a_sensor_that_goes_on_without_the_other_is_told(
     assert ("sensor_alone" in codes) == bool(alone)
     check_units(read)
     assert ("which are left out" in caplog.text) == bool(alone)
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+@pytest.mark.parametrize("part", [slice(0, 150), slice(-150, None)], ids=["start", "end"])
+def test_a_sensor_without_numbers_at_an_end_is_told_however_it_is_kept(
+    sensor, part, walk, tmp_path
+):
+    values = getattr(walk, sensor).copy()
+    values[part] = np.nan
+    cut = replace(walk, **{sensor: values})
+    write_csv(tmp_path / "w.csv", cut)
+    write_archive(tmp_path / "w.h5", [cut])
+    other = "accelerometer" if sensor == "gyro" else "gyroscope"
+    for name in ("w.csv", "w.h5"):
+        findings = inspect_recording(read_recording(tmp_path / name)).findings
+        (found,) = (finding for finding in findings if finding.code == "sensor_alone")
+        assert found.values == {other: pytest.approx(1.5)}
