@@ -8,7 +8,13 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 from told import told
 
-from stario.sequences import InputError, inspect_recording, read_recording, simulate_imu
+from stario.sequences import (
+    InputError,
+    inspect_recording,
+    read_recording,
+    simulate_imu,
+    truth_findings,
+)
 from stario.sequences.drawing.plots import imu_overview
 from stario.sequences.files import json_text
 from stario.sequences.inspection.samples import clock_findings
@@ -60,6 +66,18 @@ def test_a_clock_that_changes_for_daylight_saving_is_named(walk, by, words):
     changed = replace(walk, truth=None, time=walk.time + np.where(walk.time > 15.0, by, 0.0))
     for found, expected in zip(told(changed), words, strict=True):
         assert re.search(expected, found)
+
+
+@pytest.mark.parametrize("dropped", [0, 1, 2], ids=["before", "in the middle", "after"])
+def test_an_hour_between_halves_is_named_with_truth_as_well(walk, dropped):
+    def set_on(part):
+        return replace(part, time=part.time + np.where(part.time > 15.0, 3600.0, 0.0))
+
+    changed = replace(set_on(walk), truth=set_on(walk.truth)).select(np.arange(dropped, 3001))
+    (found,) = (found for found in told(changed) if found.startswith("time"))
+    assert "jumps ahead by 3600 s at" in found
+    assert "daylight saving" in found
+    assert truth_findings(changed) == []
 
 
 @pytest.mark.parametrize("part", ["magnetometer", "barometer", "satellites", "positions"])
