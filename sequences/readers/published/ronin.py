@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import shortlist
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.archive import is_hdf5, opened_hdf5
@@ -47,8 +48,8 @@ def read_ronin(path: Path) -> ImuSequence:
     file = path / "data.hdf5" if path.is_dir() else path
     if not file.is_file():
         raise ReadError(file, "file", "no such file", "the recording's HDF5 file")
-    info = JsonFields(file.with_name("info.json"))
     fields = _fields(file)
+    info = JsonFields(file.with_name("info.json"))
     gyro = fields[_GYRO] - info.array("imu_init_gyro_bias", 3)
     accel = info.array("imu_acce_scale", 3) * (fields[_ACCEL] - info.array("imu_acce_bias", 3))
     attitude_WB = _device_attitude(info, fields, gyro)
@@ -76,6 +77,10 @@ def is_ronin(path: Path) -> bool:
 def _fields(file: Path) -> Fields:
     """Return the required fields and the optional ones present, all of one length."""
     with opened_hdf5(file, "HDF5 data") as data:
+        if "synced" not in data:  # any HDF5 that is no archive comes here
+            found = f"no recordings in a known format, only {shortlist([*data]) or 'nothing'}"
+            expected = "imu/t in each group, as in archives, or RoNIN's synced/time"
+            raise ReadError(file, "content", found, expected)
         names = [name for name in (_TIME, *_WIDTHS) if name in data or name not in _OPTIONAL]
         if missing := [name for name in names if name not in data]:
             raise ReadError(file, missing[0], "no such field", ", ".join(names))

@@ -220,3 +220,17 @@ def test_every_reader_refuses_what_is_not_its_own_format(tmp_path, name):
         with pytest.raises(ReadError):
             read_recording(path, format=name)
     assert not FORMATS[name].recognises(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["w/data.hdf5", "w/walk.h5"])
+@pytest.mark.parametrize("groups", [["notes"], []])
+def test_an_hdf5_file_of_something_else_has_no_recordings(name, groups, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "w").mkdir()
+    with h5py.File(tmp_path / name, "w") as data:
+        for group in groups:
+            data[f"{group}/text"] = [1.0]
+    only = groups[0] if groups else "nothing"
+    assert_refused(
+        tmp_path / name, f"content: found no recordings in a known format, only {only}, expected"
+    )
