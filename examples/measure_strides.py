@@ -24,6 +24,7 @@ from stario.fusion import FilterConfig, Navigator, NavigatorConfig, network_trac
 from stario.network import load_model
 from stario.sequences import (
     ImuSequence,
+    StarioError,
     StrideCycle,
     Trajectory,
     WalkStyle,
@@ -114,7 +115,10 @@ if __name__ == "__main__":
     parser.add_argument("archives", nargs="?", type=Path)
     parser.add_argument("out", nargs="?", type=Path, default=Path("strides.npz"))
     arguments = parser.parse_args()
-    if arguments.archives:
-        measure(arguments.archives, arguments.out)
-    else:
-        main()
+    try:
+        if arguments.archives:
+            measure(arguments.archives, arguments.out)
+        else:
+            main()
+    except (StarioError, OSError) as error:
+        parser.exit(2, f"{error}\n")

@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion import ContinuousPose, Navigator, NavState, demonstration
 from stario.network import load_model
-from stario.sequences import InputError, about_z, yaw_of
+from stario.sequences import InputError, ReadError, StarioError, about_z, yaw_of
 
 GYRO_NOISE = 0.01
 """Standard deviation of one rate sample [rad/s], for the twist's covariance."""
@@ -183,13 +183,16 @@ def _attitude(pose: NavState | ContinuousPose) -> Rotation:
 
 def bag_messages(path: Path) -> Iterator[Any]:
     """Yield the Imu messages of a ROS 1 or 2 bag, read without ROS."""
-    from rosbags.highlevel import AnyReader
+    from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import Stores, get_typestore
 
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        connections = [c for c in reader.connections if c.msgtype == "sensor_msgs/msg/Imu"]
-        for connection, _, raw in reader.messages(connections[:1]):
-            yield reader.deserialize(raw, connection.msgtype)
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            connections = [c for c in reader.connections if c.msgtype == "sensor_msgs/msg/Imu"]
+            for connection, _, raw in reader.messages(connections[:1]):
+                yield reader.deserialize(raw, connection.msgtype)
+    except (AnyReaderError, OSError) as error:
+        raise ReadError(path, "bag", str(error), "one with sensor_msgs/Imu") from error
 
 
 def demonstration_messages(seconds: float) -> Iterator[Any]:
@@ -290,7 +293,10 @@ if __name__ == "__main__":
     if options.node:
         spin()
     else:
-        outputs = main(options.bag)
+        try:
+            outputs = main(options.bag)
+        except StarioError as error:
+            parser.exit(2, f"{error}\n")
         for found in outputs[::20]:
             sigma = np.sqrt(np.diag(found.pose_covariance)[:3])
             seconds = (found.stamp_ns - outputs[0].stamp_ns) / 1e9

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from stario.fusion import Navigator, Track, demonstration
 from stario.network import load_model
-from stario.sequences import read_recording, write_csv
+from stario.sequences import StarioError, read_recording, write_csv
 
 
 def fused_track(path: Path) -> Track:
@@ -32,7 +32,10 @@ def main(path: Path | None = None) -> Track:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Compute a fused track of a recording.")
     parser.add_argument("recording", nargs="?", type=Path, help="default: a simulated one")
-    track = main(parser.parse_args().recording)
+    try:
+        track = main(parser.parse_args().recording)
+    except StarioError as error:
+        parser.exit(2, f"{error}\n")
     end = track.trajectory.position_W[-1]
     sigma = track.trajectory.position_covariance_W[-1].diagonal() ** 0.5
     seconds = track.time[-1] - track.time[0]

@@ -31,7 +31,8 @@ VIRTUAL = {"cmu.h5": 0.15, "bandai.h5": 0.12}
 def stario(*arguments: object) -> None:
     """Run a command of StarIO."""
     command = Path(sys.executable).with_name("stario")
-    subprocess.run([str(command), *map(str, arguments)], check=True)
+    if code := subprocess.run([str(command), *map(str, arguments)]).returncode:
+        sys.exit(code)  # the command has said why
 
 
 def trained(data: Path, out: Path, task: tuple[str, bool]) -> None:
@@ -72,6 +73,10 @@ def main() -> None:
     if options.data is None:
         print("trains for hours on the development recordings: name their folder, --data FOLDER")
         return
+    if not (options.data / "archives").is_dir():
+        parser.exit(2, f"--data: found no {options.data / 'archives'}, expected it in the folder\n")
+    if options.jobs < 1:
+        parser.exit(2, f"--jobs: found {options.jobs}, expected at least 1\n")
     options.out.mkdir(parents=True, exist_ok=True)
     tasks = [(left_out, body) for left_out in options.sets for body in (False, True)]
     with ThreadPoolExecutor(options.jobs) as pool:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -229,6 +230,30 @@ def test_ros2_node_runs_on_recorded_bags(bag):
     assert len(outputs) > 20
     # Shaking saturates the razor's accelerometer: no track can be computed from it.
     check_odometry(outputs, np.inf if "razor" in bag.stem else 0.3)
+
+
+@pytest.mark.parametrize(
+    ("command", "found"),
+    [
+        ("run_recording.py absent.csv", "absent.csv: path: found no such file"),
+        ("replay_live.py absent.csv", "absent.csv: path: found no such file"),
+        ("replay_live.py --url http://127.0.0.1:9/data --speed 0", "speed: found 0, expected more"),
+        ("ros2_node.py absent.bag", "absent.bag: bag: found .*missing"),
+        ("measure_strides.py absent", "No such file"),
+        ("live_latency.py --seconds -5", "seconds: found -5, expected at least 3"),
+        ("sets_left_out.py --data absent", "--data: found no absent/archives"),
+        ("sets_left_out.py --data . --jobs -1", "--jobs: found -1, expected at least 1"),
+    ],
+)
+def test_what_an_example_cannot_use_is_told_in_one_line(command, found, tmp_path):
+    (tmp_path / "archives").mkdir()
+    name, *options = command.split()
+    ran = subprocess.run(
+        [sys.executable, FOLDER / name, *options], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert ran.returncode == 2
+    assert re.search(found, ran.stderr)
+    assert ran.stderr.count("\n") == 1
 
 
 def test_sets_left_out_says_what_it_needs(capsys, monkeypatch):
