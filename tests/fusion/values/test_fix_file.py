@@ -51,6 +51,23 @@ def test_an_invalid_file_raises_an_error_that_names_line_and_field(tmp_path, tex
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        (["48.15010,11.58030,3", "48.15012,11.58041,3", "48.15022,11.58051,3"], True),
+        (["48.15,11.58,3", "54.15,12.58,3", "58.15,10.58,3"], False),
+        (["48.15,11.58,3", "48.15,11.58,3", "48.15,11.58,3"], False),
+        (["48.150,11.580,0.001", "48.152,11.581,0.001", "48.151,11.583,0.001"], False),
+    ],
+    ids=["degrees", "metres", "one place", "motion capture"],
+)
+def test_positions_in_degrees_are_told(rows, told, tmp_path, caplog):
+    lines = [f"{k},position,{row}" for k, row in enumerate(rows)]
+    (tmp_path / "fixes.csv").write_text("\n".join(["t,kind,x,y,sx", *lines]))
+    assert len(read_fixes(tmp_path / "fixes.csv")) == len(rows)
+    assert ("degrees of latitude" in caplog.text) == told
+
+
 PLAIN = "t,kind,x,y,z,sx,sy,sz\n5.5,position,1,-2,3,0.1,,0.3\n\n6,yaw,0.5,,,0.05,,\n"
 LAYOUTS = {
     "short last row": PLAIN.removesuffix(",,\n"),
