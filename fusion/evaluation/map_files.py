@@ -1,4 +1,7 @@
-"""A track as files for maps: GeoJSON (RFC 7946) and GPX 1.1, in latitude and longitude."""
+"""A track as files for maps: GeoJSON (RFC 7946) and GPX 1.1, in latitude and longitude.
+
+Zero is added to rounded numbers, so that none becomes -0.0.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ def write_geojson(path: Path, name: str, parts: list[FloatArray]) -> Path:
     columns = np.vstack(parts).T
     properties: dict[str, object] = {"name": name}
     names = {"time_s": 0, "height_m": 3, "sigma_m": 5, "height_sigma_m": 6}
-    properties |= {key: columns[k].round(3).tolist() for key, k in names.items()}
+    properties |= {key: (columns[k].round(3) + 0.0).tolist() for key, k in names.items()}
     line: dict[str, Any] = {"type": "MultiLineString", "coordinates": lines}
     if len(lines) == 1:
         line = {"type": "LineString", "coordinates": lines[0]}
@@ -77,7 +80,7 @@ def _feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, 
 
 def _coordinates(part: FloatArray) -> list[list[float]]:
     """Return longitude, latitude and, if known, altitude; a line has two points at least."""
-    digits = np.column_stack([part[:, [2, 1]].round(8), part[:, 4].round(2)])
+    digits = np.column_stack([part[:, [2, 1]].round(8), part[:, 4].round(2)]) + 0.0
     listed: list[list[float]] = digits[:, : 2 if np.isnan(part[0, 4]) else 3].tolist()
     return listed if len(listed) > 1 else 2 * listed
 
@@ -107,9 +110,9 @@ def _points(part: FloatArray) -> Iterator[Any]:
     for time, latitude, longitude, height, altitude, *sigmas in part.tolist():
         known = _UNIX_TIME[0] < time < _UNIX_TIME[1]
         point = GPXTrackPoint(
-            round(latitude, 8),
-            round(longitude, 8),
-            round(height if np.isnan(altitude) else altitude, 2),
+            round(latitude, 8) + 0.0,
+            round(longitude, 8) + 0.0,
+            round(height if np.isnan(altitude) else altitude, 2) + 0.0,
             datetime.fromtimestamp(time, UTC) if known else None,
         )
         for tag, sigma in zip(("sigma", "height_sigma"), sigmas, strict=True):

@@ -1,5 +1,7 @@
 """Tracks as GeoJSON and GPX, as other programs read them."""
 
+import re
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import geojson
@@ -56,6 +58,16 @@ def test_gpx_is_read_with_heights_and_with_times_where_they_are_known(tmp_path, 
     expected = datetime.fromtimestamp(start + 20.0, UTC) if start else None
     assert last.time == expected
     assert [element.text for element in last.extensions] == ["3.00", "1.00"]
+
+
+def test_no_number_is_minus_zero(tmp_path):
+    """As of a track just below and west of the zero of map and coordinates."""
+    shifted = straight()
+    place = shifted.trajectory.position_W * 1e-5 - np.array([1e-5, 1e-5, 1e-3])
+    below = Track(replace(shifted.trajectory, position_W=place))
+    for write in (write_geojson, write_gpx):
+        path = write(tmp_path / "t", "walk", on_map(below, Georeference(0.0, 0.0, altitude_m=0.0)))
+        assert not re.search(r"-0\.0+(?!\d)", path.read_text())
 
 
 def test_a_gap_parts_the_line(tmp_path):
