@@ -289,6 +289,9 @@ def _fixes(health: Health) -> Iterator[Finding]:
     if not wrong and other.get("yaw not known", 0) > applied:
         advice = f"Two positions {_APART} give the heading; so does a yaw fix."
     text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
+    if len(health.fix_kinds) > 1:
+        kinds = ", ".join(f"{n} of {kind}" for kind, n in health.fix_kinds.items())
+        text += f" (given: {kinds})"
     if gated := other.pop("gated", 0):
         text += f", {gated} of them with less weight, since the track contradicts them"
     text += f"; {_counted(other)}." if other else "."

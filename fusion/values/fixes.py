@@ -10,6 +10,7 @@ from __future__ import annotations
 import bisect
 import logging
 import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
@@ -182,12 +183,14 @@ class FixQueue:
     Attributes:
         waiting: the waiting fixes.
         refused: number of refused fixes, by reason.
+        kinds: number of valid fixes, by kind.
     """
 
     def __init__(self, fixes: Iterable[Fix] = (), most: float = MAX_WAITING) -> None:
         self._most = most
         self.waiting: list[Fix] = []
         self.refused: dict[str, int] = {}
+        self.kinds: Counter[str] = Counter()
         for fix in fix_list(fixes):
             self.add(fix)
 
@@ -196,6 +199,7 @@ class FixQueue:
         if reason := fix.fault():
             self.refuse(reason)
             return "refused"
+        self.kinds[fix.kind] += 1
         bisect.insort(self.waiting, fix, key=by_time)
         if len(self.waiting) > self._most:
             furthest = self.waiting.pop()
@@ -226,7 +230,8 @@ class FixQueue:
     def health(self, health: Health) -> Health:
         """Add the refused and the waiting fixes to a report."""
         waiting = {"waiting": len(self.waiting)} if self.waiting else {}
-        return replace(health, fixes=health.fixes | self.refused | waiting)
+        fixes = health.fixes | self.refused | waiting
+        return replace(health, fixes=fixes, fix_kinds=dict(self.kinds))
 
 
 def make_fix(time: Any, kind: FixKind, value: Any, covariance: Any) -> Fix:

@@ -24,6 +24,7 @@ class Health:
         mean_nis: mean normalised innovation squared; its expectation is `nis_expected`.
         nis_expected: degrees of freedom of a measurement.
         fixes: numbers of fixes applied (of these gated), and refused by reason.
+        fix_kinds: numbers of fixes given, by kind.
         zero_velocity: numbers of zero-velocity updates (one per state) applied, and refused by
             reason.
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
@@ -66,6 +67,7 @@ class Health:
     mean_nis: float = float("nan")
     nis_expected: int = 3
     fixes: dict[str, int] = field(default_factory=dict)
+    fix_kinds: dict[str, int] = field(default_factory=dict)
     zero_velocity: dict[str, int] = field(default_factory=dict)
     bearings: dict[str, int] = field(default_factory=dict)
     corrections: list[tuple[float, float, float, str]] = field(default_factory=list)

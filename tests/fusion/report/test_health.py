@@ -48,6 +48,8 @@ NOTHING = "nothing"
         (SHAKEN | {"gated": 3}, ["samples_flagged"], "", ""),
         (GOOD | {"fixes": {"applied": 3, "gated": 1}}, ["fixes"], "", "frame"),
         (GOOD | {"fixes": {"applied": 30, "gated": 1}}, [], "fixes", ""),
+        (GOOD | {"fixes": {"applied": 5}, "fix_kinds": {"position": 4, "yaw": 1}}, [], "fixes",
+         "5 fixes applied (given: 4 of position, 1 of yaw)."),
         # One stands with a receiver: two positions that are apart are still to come.
         (GOOD | {"fixes": {"applied": 2, "yaw not known": 580}}, [], "fixes", "sigma apart"),
         (GOOD | {"bearings": {"no horizontal field": 120}}, [], "field_useless", ""),

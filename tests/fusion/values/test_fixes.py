@@ -9,7 +9,8 @@ from support import WHITE_ERRORS as ERRORS
 from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.imu.intervals import split_at
 from stario.fusion.recording import cut_recording
-from stario.fusion.values.fixes import Fix, position_fix, velocity_fix, yaw_fix
+from stario.fusion.values.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
+from stario.fusion.values.health import Health
 from stario.fusion.values.lie import UNKNOWN_YAW
 from stario.sequences import ImuSequence, about_z, yaw_of
 
@@ -298,3 +299,10 @@ def test_the_covariance_of_an_exact_fix_has_a_floor(walk, model):
 @pytest.mark.parametrize("place", [[48.1, 11.5, 12.0], [690_000.0, 5_330_000.0, 500.0]])
 def test_metres_are_not_taken_for_degrees(still_model, place):
     assert Navigator(still_model).update_position(0.0, place, EYE) == "waiting"
+
+
+def test_a_report_tells_the_kinds_of_the_fixes_given():
+    given = [position_fix(t, np.zeros(3), np.eye(3)) for t in (1.0, 2.0, np.nan)]
+    queue = FixQueue([*given, yaw_fix(1.0, 0.5, 0.1)])
+    queue.due(1.5)
+    assert queue.health(Health()).fix_kinds == {"position": 2, "yaw": 1}
