@@ -292,7 +292,7 @@ def files_of(value: int) -> Files:
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
 @pytest.mark.parametrize("earlier", [True, False])
 def test_a_run_that_fails_at_any_write_leaves_what_was_there(tmp_path, failing, error, earlier):
-    out = tmp_path / "out"
+    out = tmp_path / "runs/out"
     if earlier:
         write_results(out, files_of(1))
         (out / "notes.txt").write_text("mine")
@@ -305,7 +305,8 @@ def test_a_run_that_fails_at_any_write_leaves_what_was_there(tmp_path, failing, 
     with pytest.raises((InputError, KeyboardInterrupt)):
         write_results(out, {**files_of(2), failing: full})
     assert contents(tmp_path) == before
-    assert list(tmp_path.iterdir()) == ([out] if earlier else [])
+    assert list(tmp_path.rglob("out*")) == ([out] if earlier else [])
+    assert (tmp_path / "runs").exists() == earlier
 
 
 def test_a_later_set_replaces_results_and_removes_those_without_a_successor(tmp_path):
