@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from numbers import Real
 from pathlib import Path
@@ -47,6 +49,16 @@ def read_settings(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(str(path), type(values).__name__, "a table of values")
     return values
+
+
+@contextmanager
+def naming(path: Path | str) -> Iterator[None]:
+    """Add the name of the file whose settings are used to errors in the block."""
+    try:
+        yield
+    except ConfigError as error:
+        field = f"{path}: {error.field}"
+        raise ConfigError(field, error.found, error.expected, error.fix) from error
 
 
 def with_settings(default: Group, values: object, name: str = "") -> Group:

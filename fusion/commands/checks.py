@@ -334,7 +334,7 @@ def table(
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.stream_cache import cache_folder
     from stario.sequences.files import make_folder
-    from stario.sequences.settings import read_settings
+    from stario.sequences.settings import naming, read_settings
 
     if data is None:
         options.refuse(context, "without --data", "use with --data", "sets", "per_group")
@@ -342,7 +342,8 @@ def table(
     chosen = None if networks is None else common.names_in(networks)
     packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
     recipe = read_settings(config or Path(str(packaged)))
-    runs = table_runs(datasets, recipe, steps, chosen, seeds)
+    with naming(config or str(packaged)):
+        runs = table_runs(datasets, recipe, steps, chosen, seeds)
     make_folder(out)
     requested = {run.network for run in runs}
     costs = known_costs([name for name in ARCHITECTURES if name in requested], out)

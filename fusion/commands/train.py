@@ -299,11 +299,13 @@ def _recipe(
     path: Path | None, first: DisplacementModel | None, **over: int | str | None
 ) -> TrainingConfig:
     from stario.network.training.config import FINE_TUNING, training_config
-    from stario.sequences.settings import read_settings
+    from stario.sequences.settings import naming, read_settings
 
     values = {} if first is None else FINE_TUNING
     if path is not None:
         values = read_settings(path)
+        with naming(path):
+            training_config(values)
     if first is not None:
         values = {"architecture": first.card.architecture, **values}
     recipe = training_config(values | {k: v for k, v in over.items() if v is not None})

@@ -17,7 +17,7 @@ from stario.sequences.errors import ConfigError
 from stario.sequences.geodesy import Georeference
 from stario.sequences.noise import GYRO_SCALE_ERROR, ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.settings import check_number, read_settings, with_settings
+from stario.sequences.settings import check_number, naming, read_settings, with_settings
 from stario.sequences.windows import WINDOW_SECONDS
 
 UPDATE_RATES = (1, 2, 5, 10, 20)
@@ -246,8 +246,5 @@ def read_config(path: Path | str) -> NavigatorConfig:
         ConfigError: the file is missing or malformed, a key is unknown or a value is invalid.
     """
     values = read_settings(Path(path))
-    try:
+    with naming(path):
         return with_settings(NavigatorConfig(), values)
-    except ConfigError as error:
-        field = f"{path}: {error.field}"
-        raise ConfigError(field, error.found, error.expected, error.fix) from error

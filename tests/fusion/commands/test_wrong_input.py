@@ -128,7 +128,8 @@ def test_an_option_that_would_do_nothing_is_refused(stario, recording, tmp_path,
     [
         ("compare", '{"filter": {"speed": 1}}', "filter.speed"),
         ("run", "{", "settings.json"),
-        ("train", '{"speed": 1}', "speed"),
+        ("train", '{"speed": 1}', "settings.json: speed"),
+        ("train", '{"epochs": 0}', "settings.json: epochs"),
     ],
 )
 def test_an_invalid_setting_is_named_in_one_line(stario, recording, command, content, named):
