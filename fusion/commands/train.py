@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -151,6 +152,7 @@ def train(
         common.list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a cluster's end of time tells, too
     try:
         with common.training_progress(recipe.steps, shown=is_leader()) as progress:
             path = train_network(

@@ -1,6 +1,7 @@
 """The command train: weights that can be run, what it learned from, what it refuses."""
 
 import json
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,6 +43,14 @@ def test_weights_that_train_writes_can_be_run(stario, recording, tmp_path, tiny)
     content[-1] ^= 1
     weights.write_bytes(bytes(content))
     stario("run", recording, "--model", weights).assert_one_line_error("model.safetensors")
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_training_that_is_stopped_says_how_to_go_on(stario, monkeypatch, tiny, stop):
+    monkeypatch.setattr("stario.network.training.train.train", lambda *_: signal.raise_signal(stop))
+    done = stario("train", "--generated", 1, "--config", tiny, "--out", "stopped")
+    assert done.code != 0
+    assert "the same command goes on from the last epoch in stopped" in done.err
 
 
 @pytest.mark.usefixtures("narrow_network")
