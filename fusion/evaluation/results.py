@@ -197,32 +197,18 @@ def write_results(folder: Path, files: Files) -> list[Path]:
     """
     check_folder(folder)
     # Within a folder that exists: it may be a mount, to which no file of another one can move.
-    place = folder / "results" if folder.is_dir() else folder
-    with _parents_made(folder), temporary_path(place, "a folder") as new:
+    existing = next(part for part in (folder, *folder.parents) if part.is_dir())
+    with temporary_path(existing / "results", "a folder") as new:
         new.mkdir()
         for name, write in files.items():
             (new / name).parent.mkdir(exist_ok=True)
             write(new / name)
-        folder.mkdir(exist_ok=True)
+        make_folder(folder)
         with _locked(folder):
             for source in [new, *(path for path in new.iterdir() if path.is_dir())]:
                 _move_results(source, folder / source.relative_to(new))
         shutil.rmtree(new)
     return [folder / name for name in files]
-
-
-@contextmanager
-def _parents_made(folder: Path) -> Iterator[None]:
-    """Create the folders above one; after an exception remove the new ones that are empty."""
-    absent = [parent for parent in folder.parents if not parent.exists()]
-    make_folder(folder.parent)
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):  # one in which another process has written
-            for parent in absent:
-                parent.rmdir()
-        raise
 
 
 def _move_results(source: Path, target: Path) -> None:
