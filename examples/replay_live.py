@@ -22,7 +22,7 @@ import numpy as np
 
 from stario.fusion import LiveServer, Navigator, demonstration
 from stario.network import load_model
-from stario.sequences import ImuSequence, InputError, StarioError, read_recording
+from stario.sequences import ImuSequence, StarioError, read_recording
 
 PERIOD = 0.2
 """Time between two pushes [s]; the app offers similar settings."""
@@ -32,8 +32,6 @@ def replay(
     recording: ImuSequence, url: str, speed: float, seconds: float, device: str = "replay"
 ) -> int:
     """Push a recording in batches; return the number of samples that the server accepted."""
-    if not speed > 0.0:
-        raise InputError("speed", f"{speed:g}", "more than 0")
     first_ns, began, accepted = time.time_ns(), time.monotonic(), 0
     stop = min(recording.duration, seconds)
     sensors = [
@@ -112,6 +110,8 @@ if __name__ == "__main__":
     parser.add_argument("--speed", type=float, default=1.0, help="with --url: times the true speed")
     parser.add_argument("--device", default="replay", help="name of the phone")
     options = parser.parse_args()
+    if not options.speed > 0.0:
+        parser.exit(2, f"--speed: found {options.speed:g}, expected more than 0\n")
     try:
         walk = read_recording(options.recording) if options.recording else demonstration()
         if options.url is None:

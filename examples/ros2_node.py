@@ -183,16 +183,15 @@ def _attitude(pose: NavState | ContinuousPose) -> Rotation:
 
 def bag_messages(path: Path) -> Iterator[Any]:
     """Yield the Imu messages of a ROS 1 or 2 bag, read without ROS."""
-    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            connections = [c for c in reader.connections if c.msgtype == "sensor_msgs/msg/Imu"]
-            for connection, _, raw in reader.messages(connections[:1]):
-                yield reader.deserialize(raw, connection.msgtype)
-    except (AnyReaderError, OSError) as error:
-        raise ReadError(path, "bag", str(error), "one with sensor_msgs/Imu") from error
+    if not path.exists():
+        raise ReadError(path, "path", "no such file or folder", "a bag")
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        connections = [c for c in reader.connections if c.msgtype == "sensor_msgs/msg/Imu"]
+        for connection, _, raw in reader.messages(connections[:1]):
+            yield reader.deserialize(raw, connection.msgtype)
 
 
 def demonstration_messages(seconds: float) -> Iterator[Any]:

@@ -237,10 +237,10 @@ def test_ros2_node_runs_on_recorded_bags(bag):
     [
         ("run_recording.py absent.csv", "absent.csv: path: found no such file"),
         ("replay_live.py absent.csv", "absent.csv: path: found no such file"),
-        ("replay_live.py --url http://127.0.0.1:9/data --speed 0", "speed: found 0, expected more"),
-        ("ros2_node.py absent.bag", "absent.bag: bag: found .*missing"),
+        ("replay_live.py --speed 0", "--speed: found 0, expected more"),
+        ("ros2_node.py absent.bag", "absent.bag: path: found no such file"),
         ("measure_strides.py absent", "No such file"),
-        ("live_latency.py --seconds -5", "seconds: found -5, expected at least 3"),
+        ("live_latency.py --seconds -5", "--seconds: found -5, expected at least 3"),
         ("sets_left_out.py --data absent", "--data: found no absent/archives"),
         ("sets_left_out.py --data . --jobs -1", "--jobs: found -1, expected at least 1"),
     ],
