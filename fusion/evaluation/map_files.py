@@ -1,7 +1,4 @@
-"""A track as files for maps: GeoJSON (RFC 7946) and GPX 1.1, in latitude and longitude.
-
-Zero is added to rounded numbers, so that none becomes -0.0.
-"""
+"""A track as files for maps: GeoJSON (RFC 7946) and GPX 1.1, in latitude and longitude."""
 
 from __future__ import annotations
 
@@ -60,6 +57,7 @@ def write_geojson(path: Path, name: str, parts: list[FloatArray]) -> Path:
     columns = np.vstack(parts).T
     properties: dict[str, object] = {"name": name}
     names = {"time_s": 0, "height_m": 3, "sigma_m": 5, "height_sigma_m": 6}
+    # Zero is added to what is rounded, here and below, so that none becomes -0.0.
     properties |= {key: (columns[k].round(3) + 0.0).tolist() for key, k in names.items()}
     line: dict[str, Any] = {"type": "MultiLineString", "coordinates": lines}
     if len(lines) == 1:

@@ -33,9 +33,6 @@ _REQUIRED = (*_COLUMNS[:3], "sx")
 
 log = logging.getLogger(__name__)
 
-_FEW, _UNMOVED = 3, 0.1
-"""Number of positions from which they are a walk, and share of their sigma that is no walk."""
-
 _UNITS = {"t": ("s",), "kind": ()}
 """Units that a header may name for a column; for the others m, m/s and rad."""
 
@@ -67,23 +64,19 @@ def read_fixes(path: Path | str) -> list[Fix]:
         fixes.append(_read_row(path, f"line {number}", header, cells))
     if not fixes:
         raise ReadError(path, "file", "a header only", "at least one fix")
-    _warn_of_degrees(path, [fix for fix in fixes if fix.kind == "position"])
+    positions = [fix for fix in fixes if fix.kind == "position"]
+    if len(positions) > 2:
+        _warn_of_degrees(path, positions)
     return fixes
 
 
 def _warn_of_degrees(path: Path, positions: list[Fix]) -> None:
-    """Say if positions differ by hardly any of their sigmas, as a walk in degrees does."""
-    if len(positions) < _FEW:
-        return
-    places = np.array([fix.value[:2] for fix in positions])
-    sigma = min(float(np.sqrt(fix.covariance[:2, :2].diagonal().min())) for fix in positions)
-    extent = float(np.ptp(places, axis=0).max())
-    if 0.0 < extent < _UNMOVED * sigma and 1.0 < np.abs(places).max() <= 360.0:
-        log.warning(
-            "%s: all positions are within %.2g m of one another: if x and y are degrees of "
-            "latitude and longitude, write metres in a map, see `stario.sequences.Georeference`",
-            path, extent,
-        )  # fmt: skip
+    """Say if positions differ by hardly any of their sigma, as those of a walk in degrees do."""
+    extent = float(np.ptp([fix.value[:2] for fix in positions], axis=0).max())
+    if 0.0 < extent < 0.1 * math.sqrt(min(fix.covariance[0, 0] for fix in positions)):
+        text = "%s: its positions are within %.2g m: if x and y are degrees of latitude and "
+        text += "longitude, write metres (`stario.sequences.Georeference` converts)"
+        log.warning(text, path, extent)
 
 
 def _trimmed(row: list[str]) -> list[str]:
