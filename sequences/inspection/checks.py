@@ -29,9 +29,6 @@ from stario.sequences.units import FAST_RAD_S, GYRO_UNITS
 MIN_SECONDS = 1.5
 """Shortest recording that holds a window and a margin around it [s]."""
 
-_ALONE_S = 1.0
-"""Time [s] at a recording's ends without one of the sensors that needs no mention."""
-
 _SHORTEST_S = 0.9
 _WINDOW_S = 4.0
 _WINDOWS = 12
@@ -145,15 +142,12 @@ def unit_findings(sequence: ImuSequence) -> list[Finding]:
 
 def _alone_s(sequence: ImuSequence) -> dict[str, float]:
     """Return seconds at either end in which one sensor alone holds numbers, as files of one do."""
-    gyro, accel = (
-        np.flatnonzero(np.isfinite(x).all(axis=1)) for x in (sequence.gyro, sequence.accel)
-    )
-    counts = {
-        "gyroscope": max(accel[0] - gyro[0], 0) + max(gyro[-1] - accel[-1], 0),
-        "accelerometer": max(gyro[0] - accel[0], 0) + max(accel[-1] - gyro[-1], 0),
-    }
-    alone_s = {name: float(count) / sequence.rate for name, count in counts.items()}
-    return {name: s for name, s in alone_s.items() if s > _ALONE_S}
+    samples = sequence.gyro, sequence.accel
+    gyro, accel = (np.flatnonzero(np.isfinite(x).all(axis=1))[[0, -1]] for x in samples)
+    longer = (gyro - accel) * [-1, 1]  # the gyroscope at the start and at the end, in samples
+    counts = {"gyroscope": longer.clip(min=0), "accelerometer": -longer.clip(max=0)}
+    alone_s = {name: float(count.sum()) / sequence.rate for name, count in counts.items()}
+    return {name: s for name, s in alone_s.items() if s > _SHORTEST_S}
 
 
 def downward(accel: FloatArray) -> list[Finding]:

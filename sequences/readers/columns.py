@@ -96,10 +96,8 @@ _UNITS = {*ACCEL_UNITS, *GYRO_UNITS, *MAGNETIC_UNITS, *TIME_UNITS}
 _QUOTES = " \"'"
 
 _HEAD_LINES = 200
-"""Number of lines within which the header must be for a file to be recognised."""
-
-_CLOCK_ROWS = 1000
-"""Number of rows that show which of several clocks is the finest."""
+"""Number of lines within which the header must be for a file to be recognised, and of the rows that
+show which of several clocks is the finest."""
 
 _FEWEST_UNITS = 3
 """Number of cells that make a row of units: those of one sensor."""
@@ -129,21 +127,18 @@ def read_header(path: Path, lines: list[str]) -> Header:
         raise ReadError(path, f"line {number}", found, f"titles, {HEADER}", fix)
     titles, below = _titles(line), lines[number] if number < len(lines) else ""
     with_units = with_units_below(titles, below.split(_separator(line)))
+    titles_used = with_units or titles
     start = number + (with_units is not None)
-    rows = [row.split(_separator(line)) for row in lines[start : start + _CLOCK_ROWS]]
-    columns = _columns(path, number, _with_finest_clock(path, with_units or titles, rows))
+    rows = [row.split(_separator(line)) for row in lines[start : start + _HEAD_LINES]]
+    columns = _columns(path, number, titles_used, _finest_clock(titles_used, rows))
     return Header(start, _separator(line), titles, columns)
 
 
-def _with_finest_clock(path: Path, titles: list[str], rows: list[list[str]]) -> list[str]:
-    """Return titles without those of further clocks, `t` beside `timestamp`, that repeat more."""
+def _finest_clock(titles: list[str], rows: list[list[str]]) -> int:
+    """Return the index of the clock, of `t` and `timestamp` the one that repeats less; else -1."""
     clocks = [k for k, name in enumerate(_names(titles)) if name == "t"]
-    if len(clocks) < 2:
-        return titles
-    used = max(clocks, key=lambda k: len({cell for row in rows for cell in row[k : k + 1]}))
-    others = ", ".join(_cell(titles[k])[0] for k in clocks if k != used)
-    _log.info("%s: times are read from %s, not from %s", path, _cell(titles[used])[0], others)
-    return ["" if k in clocks and k != used else title for k, title in enumerate(titles)]
+    values = {k: {cell for row in rows for cell in row[k : k + 1]} for k in clocks}
+    return max(clocks, key=lambda k: len(values[k]), default=-1)
 
 
 def _header_index(lines: list[str]) -> int | None:
@@ -178,13 +173,13 @@ def with_units_below(titles: list[str], below: list[str]) -> list[str] | None:
     return [f"{title.strip(_QUOTES)} [{unit}]" if unit else title for title, unit in pairs]
 
 
-def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
+def _columns(path: Path, number: int, titles: list[str], clock: int) -> dict[str, Column]:
     columns: dict[str, Column] = {}
     ignored = []
     for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
         title, unit = _cell(text)
         unit = unit_named(unit) or (time_unit_of(title) if name == "t" else unit_of(title))
-        if not name or (name in RARE and name in columns):
+        if not name or (name in RARE and name in columns) or (name == "t" and index != clock):
             ignored.append(title)
         elif name in RARE and unit not in RARE_UNITS[name]:
             known = ", ".join(filter(None, RARE_UNITS[name]))

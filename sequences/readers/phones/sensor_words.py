@@ -57,19 +57,8 @@ _NOT_SAMPLES = {
     *("bias", "drift", "offset", "calib", "calibration", "accuracy", "std", "variance"),
     *("meta", "metadata", "down", "step", "steps", "estimated"),
 }
-_TIME = {
-    "t",
-    "ts",
-    "time",
-    "times",
-    "timestamp",
-    "timestamps",
-    "seconds",
-    "elapsed",
-    "millis",
-    "nanos",
-}
-_TIME |= {"datetime", "epoch", "epoc", "uptime", "zeit", "tiempo", "temps", "tempo"}
+_TIME = {"t", "time", "times", "timestamp", "timestamps", "seconds", "elapsed", "millis", "nanos"}
+_TIME |= {"ts", "datetime", "epoch", "epoc", "uptime", "zeit", "tiempo", "temps", "tempo"}
 _NO_TIME = {"date", "zone", "timezone", "txt", "gps", "location", "utc", "format"}
 _UNIT_WORDS = {
     **dict.fromkeys(("ns", "nano", "nanos", "nanosecond", "nanoseconds"), "ns"),

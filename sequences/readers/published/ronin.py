@@ -22,7 +22,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import shortlist
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.archive import is_hdf5, opened_hdf5
@@ -78,9 +77,8 @@ def _fields(file: Path) -> Fields:
     """Return the required fields and the optional ones present, all of one length."""
     with opened_hdf5(file, "HDF5 data") as data:
         if "synced" not in data:  # any HDF5 that is no archive comes here
-            found = f"no recordings in a known format, only {shortlist([*data]) or 'nothing'}"
             expected = "imu/t in each group, as in archives, or RoNIN's synced/time"
-            raise ReadError(file, "content", found, expected)
+            raise ReadError(file, "content", "no recordings in a known format", expected)
         names = [name for name in (_TIME, *_WIDTHS) if name in data or name not in _OPTIONAL]
         if missing := [name for name in names if name not in data]:
             raise ReadError(file, missing[0], "no such field", ", ".join(names))
