@@ -9,8 +9,7 @@ from support import WHITE_ERRORS as ERRORS
 from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.imu.intervals import split_at
 from stario.fusion.recording import cut_recording
-from stario.fusion.values.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
-from stario.fusion.values.health import Health
+from stario.fusion.values.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.values.lie import UNKNOWN_YAW
 from stario.sequences import ImuSequence, about_z, yaw_of
 
@@ -87,6 +86,8 @@ def test_a_fix_is_applied_at_its_own_time_however_late(walk, model, fixed, late)
     assert_same(state, fixed)
     assert state.map_frame == 2
     assert navigator.health.fixes["applied"] == fixed.health.fixes["applied"] == 4
+    assert sum(navigator.health.fix_kinds.values()) == 4
+    assert navigator.health.fix_kinds == fixed.health.fix_kinds
     assert navigator.health.updates == fixed.health.updates
     assert navigator.health.mean_nis == pytest.approx(fixed.health.mean_nis)
     assert navigator.health.zero_velocity == fixed.health.zero_velocity
@@ -299,10 +300,3 @@ def test_the_covariance_of_an_exact_fix_has_a_floor(walk, model):
 @pytest.mark.parametrize("place", [[48.1, 11.5, 12.0], [690_000.0, 5_330_000.0, 500.0]])
 def test_metres_are_not_taken_for_degrees(still_model, place):
     assert Navigator(still_model).update_position(0.0, place, EYE) == "waiting"
-
-
-def test_a_report_tells_the_kinds_of_the_fixes_given():
-    given = [position_fix(t, np.zeros(3), np.eye(3)) for t in (1.0, 2.0, np.nan)]
-    queue = FixQueue([*given, yaw_fix(1.0, 0.5, 0.1)])
-    queue.due(1.5)
-    assert queue.health(Health()).fix_kinds == {"position": 2, "yaw": 1}
