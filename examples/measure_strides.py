@@ -116,9 +116,6 @@ if __name__ == "__main__":
     parser.add_argument("out", nargs="?", type=Path, default=Path("strides.npz"))
     arguments = parser.parse_args()
     try:
-        if arguments.archives:
-            measure(arguments.archives, arguments.out)
-        else:
-            main()
+        measure(arguments.archives, arguments.out) if arguments.archives else main()
     except (StarioError, OSError) as error:
         parser.exit(2, f"{error}\n")

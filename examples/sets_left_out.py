@@ -73,10 +73,10 @@ def main() -> None:
     if options.data is None:
         print("trains for hours on the development recordings: name their folder, --data FOLDER")
         return
-    if not (options.data / "archives").is_dir():
-        parser.exit(2, f"--data: found no {options.data / 'archives'}, expected it in the folder\n")
-    if options.jobs < 1:
-        parser.exit(2, f"--jobs: found {options.jobs}, expected at least 1\n")
+    if not options.data.is_dir() or options.jobs < 1:
+        parser.exit(
+            2, f"--data {options.data} --jobs {options.jobs}: expected a folder, 1 or more\n"
+        )
     options.out.mkdir(parents=True, exist_ok=True)
     tasks = [(left_out, body) for left_out in options.sets for body in (False, True)]
     with ThreadPoolExecutor(options.jobs) as pool:

@@ -241,12 +241,11 @@ def test_ros2_node_runs_on_recorded_bags(bag):
         ("ros2_node.py absent.bag", "absent.bag: path: found no such file"),
         ("measure_strides.py absent", "No such file"),
         ("live_latency.py --seconds -5", "--seconds: found -5, expected at least 3"),
-        ("sets_left_out.py --data absent", "--data: found no absent/archives"),
-        ("sets_left_out.py --data . --jobs -1", "--jobs: found -1, expected at least 1"),
+        ("sets_left_out.py --data absent", "--data absent --jobs 1: expected a folder"),
+        ("sets_left_out.py --data . --jobs -1", "--jobs -1: expected a folder, 1 or more"),
     ],
 )
 def test_what_an_example_cannot_use_is_told_in_one_line(command, found, tmp_path):
-    (tmp_path / "archives").mkdir()
     name, *options = command.split()
     ran = subprocess.run(
         [sys.executable, FOLDER / name, *options], cwd=tmp_path, capture_output=True, text=True

@@ -14,14 +14,13 @@ A position without z is horizontal; its height is unknown. Lines that begin with
 from __future__ import annotations
 
 import csv
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from stario.fusion.values.fixes import KINDS, MAX_YAW, UNKNOWN_HEIGHT, Fix, make_fix
+from stario.fusion.values.fixes import KINDS, MAX_YAW, UNKNOWN_HEIGHT, Fix, log, make_fix
 from stario.fusion.values.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.text import decimal_mark, read_lines
@@ -30,8 +29,6 @@ from stario.sequences.time_order import increasing_mask
 
 _COLUMNS = ("t", "kind", "x", "y", "z", "sx", "sy", "sz")
 _REQUIRED = (*_COLUMNS[:3], "sx")
-
-log = logging.getLogger(__name__)
 
 _UNITS = {"t": ("s",), "kind": ()}
 """Units that a header may name for a column; for the others m, m/s and rad."""
