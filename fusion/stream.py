@@ -130,7 +130,7 @@ class Stream:
         """Apply a fix, or keep it until its time."""
         if self.state is None or fix.fault() or fix.time > self.state.time:
             return self._fixes.add(fix)
-        self._fixes.kinds[fix.kind] += 1
+        self._fixes.count(fix)
         before, found = self.state, estimator.late_fix(self.state, fix, self._config)
         if found is None:
             self._fixes.refuse("too late")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import bisect
 import logging
 import math
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
@@ -190,7 +189,7 @@ class FixQueue:
         self._most = most
         self.waiting: list[Fix] = []
         self.refused: dict[str, int] = {}
-        self.kinds: Counter[str] = Counter()
+        self.kinds: dict[str, int] = {}
         for fix in fix_list(fixes):
             self.add(fix)
 
@@ -199,7 +198,7 @@ class FixQueue:
         if reason := fix.fault():
             self.refuse(reason)
             return "refused"
-        self.kinds[fix.kind] += 1
+        self.count(fix)
         bisect.insort(self.waiting, fix, key=by_time)
         if len(self.waiting) > self._most:
             furthest = self.waiting.pop()
@@ -207,6 +206,10 @@ class FixQueue:
             if furthest is fix:
                 return "refused"
         return "waiting"
+
+    def count(self, fix: Fix) -> None:
+        """Count a valid fix by its kind."""
+        self.kinds[fix.kind] = self.kinds.get(fix.kind, 0) + 1
 
     def due(self, time: float) -> list[Fix]:
         """Remove and return the fixes up to a time [s], in order."""
