@@ -127,18 +127,10 @@ def read_header(path: Path, lines: list[str]) -> Header:
         raise ReadError(path, f"line {number}", found, f"titles, {HEADER}", fix)
     titles, below = _titles(line), lines[number] if number < len(lines) else ""
     with_units = with_units_below(titles, below.split(_separator(line)))
-    titles_used = with_units or titles
     start = number + (with_units is not None)
     rows = [row.split(_separator(line)) for row in lines[start : start + _HEAD_LINES]]
-    columns = _columns(path, number, titles_used, _finest_clock(titles_used, rows))
+    columns = _columns(path, number, with_units or titles, rows)
     return Header(start, _separator(line), titles, columns)
-
-
-def _finest_clock(titles: list[str], rows: list[list[str]]) -> int:
-    """Return the index of the clock, of `t` and `timestamp` the one that repeats less; else -1."""
-    clocks = [k for k, name in enumerate(_names(titles)) if name == "t"]
-    values = {k: {cell for row in rows for cell in row[k : k + 1]} for k in clocks}
-    return max(clocks, key=lambda k: len(values[k]), default=-1)
 
 
 def _header_index(lines: list[str]) -> int | None:
@@ -173,13 +165,18 @@ def with_units_below(titles: list[str], below: list[str]) -> list[str] | None:
     return [f"{title.strip(_QUOTES)} [{unit}]" if unit else title for title, unit in pairs]
 
 
-def _columns(path: Path, number: int, titles: list[str], clock: int) -> dict[str, Column]:
+def _columns(
+    path: Path, number: int, titles: list[str], rows: list[list[str]]
+) -> dict[str, Column]:
     columns: dict[str, Column] = {}
-    ignored = []
-    for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
+    ignored, names = [], _names(titles)
+    clocks = [k for k, name in enumerate(names) if name == "t"]  # `t` and `timestamp`
+    values = {k: {cell for row in rows for cell in row[k : k + 1]} for k in clocks}
+    coarse = sorted(clocks, key=lambda k: -len(values[k]))[1:]  # these repeat more
+    for index, (text, name) in enumerate(zip(titles, names, strict=True)):
         title, unit = _cell(text)
         unit = unit_named(unit) or (time_unit_of(title) if name == "t" else unit_of(title))
-        if not name or (name in RARE and name in columns) or (name == "t" and index != clock):
+        if not name or (name in RARE and name in columns) or index in coarse:
             ignored.append(title)
         elif name in RARE and unit not in RARE_UNITS[name]:
             known = ", ".join(filter(None, RARE_UNITS[name]))
@@ -215,13 +212,7 @@ def _columns(path: Path, number: int, titles: list[str], clock: int) -> dict[str
 
 def _log_ignored(path: Path, ignored: list[str], has_truth: bool) -> None:
     _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
-    others = [
-        title
-        for title in ignored
-        if (axis := axis_of(title))
-        and not is_uncalibrated(axis[1])
-        and sensor_of(axis[1]) in ("gyro", "accel")
-    ]
+    others = [title for title in ignored if _spelled(title) in IMU]
     if others:
         _log.warning("%s: columns of another IMU are not read: %s", path, ", ".join(others))
     truth_like = ", ".join(title for title in ignored if _LIKE_TRUTH.match(title))
