@@ -152,7 +152,7 @@ def train(
         common.list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a cluster's end of time tells, too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which would end without a word
     try:
         with common.training_progress(recipe.steps, shown=is_leader()) as progress:
             path = train_network(
