@@ -282,6 +282,9 @@ def _with_displacement(
 def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorState, Gained | None]:
     """Update with the magnetic field; return what it told about attitude and bias, too."""
     m_B, reference, before = interval.field_B, s.magnetic, s.ekf
+    if interval.field_anew and not reference.held:
+        s = changed(s.both(magnetic.without_field), magnetic=magnetic.MagneticReference())
+        reference, before = s.magnetic, s.ekf
     if m_B is None or not reference.is_due(interval.stop, before):
         return s, None
     after, result, updated = magnetic.update_bearing(before, reference, m_B)

@@ -104,6 +104,8 @@ class MagneticReference:
         spread: mean deviation of size (fraction) and dip [rad] from these along the path.
         places: number of bearings averaged in it.
         measured: size of the last field, with the device's hard iron [uT].
+        held: whether the device had carried that field on by its gyroscope: a step after it is the
+            field's, which the device had not followed.
         rotation: how the field has changed while the device rotated.
         pose: attitude R_WB (3, 3) and position p_W (3,) [m] at the last bearing.
     """
@@ -115,6 +117,7 @@ class MagneticReference:
     spread: float = _FIRST_SPREAD
     places: int = _FIRST_COUNT
     measured: float = 0.0
+    held: bool = False
     rotation: FieldRotation = field(default_factory=FieldRotation)
     pose: tuple[FloatArray, FloatArray] | None = None
 
@@ -234,6 +237,14 @@ def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
     return changed(s, covariances=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
 
 
+def without_field(s: EkfState) -> EkfState:
+    """Return the state without its field, for one that is measured with another hard iron."""
+    if s.field is None:
+        return s
+    n = s.field_row
+    return changed(s, covariances=s.covariances[:, :n, :n], field=None)
+
+
 def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     """Return the state with its azimuth and hard iron propagated for a time [s].
 
@@ -276,7 +287,7 @@ def update_bearing(
         return s, UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
     held = reference.is_held(measured)
     reference = reference.updated(now, size, dip, reference.travelled(s) and not held)
-    reference = changed(reference, measured=measured)
+    reference = changed(reference, measured=measured, held=held)
     sigma = BEARING_SIGMA * reference.disturbance_sigma / DISTURBANCE_SIGMA
     variance = sigma**2 * (1.0 + reference.unusual(size, dip) ** 2)
     variance *= _HELD_FACTOR if held else 1.0

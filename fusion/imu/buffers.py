@@ -26,6 +26,13 @@ _MAX_REPEATED = 0.5
 """Maximum time for which a field may repeat itself [s]: slow sensors are logged several times, but
 one that repeats its value for longer has stopped."""
 
+_CALIBRATED, _SUDDEN, _MAX_PERIOD = 30.0, 4.0, 0.2
+"""A field that changes by more than the first [uT] from one sample to the next, and by this factor
+more than before and after, belongs to a device that has calibrated its magnetometer anew: no place
+or magnet does so within a sample. The change is three sigmas of the hard iron that a calibration
+leaves; there were 57 and 121 uT as people shook their phones for it (IPIN 2023, Trial01_1, 01_3).
+Samples further apart than the last [s] do not tell."""
+
 Value = TypeVar("Value")
 
 
@@ -63,7 +70,8 @@ class FieldBuffer(TimedBuffer[FloatArray]):
     def __init__(self) -> None:
         super().__init__()
         self._value: tuple[float, ...] = ()
-        self._since = math.inf
+        self._since = self._calibrated_at = -math.inf
+        self._changes = math.inf, math.inf
 
     def add(self, time: float, field_B: FloatArray, now: float) -> bool:
         """Add a field (3,) in B [uT]; return False if it, its time or its sensor cannot be right.
@@ -74,6 +82,11 @@ class FieldBuffer(TimedBuffer[FloatArray]):
         if not (self.fits(time, now) and sum(map(abs, value)) < MAX_SENSOR_VALUE):
             return False
         if value != self._value:
+            change = math.dist(value, self._value) if time - self._since < _MAX_PERIOD else math.inf
+            before, last = self._changes
+            if math.inf > last > max(_CALIBRATED, _SUDDEN * before, _SUDDEN * change):
+                self._calibrated_at = self._since
+            self._changes = last, change
             self._value, self._since = value, time
         return time - self._since <= _MAX_REPEATED and self.keep(time, field_B)
 
@@ -88,3 +101,10 @@ class FieldBuffer(TimedBuffer[FloatArray]):
         while self._waiting and self._waiting[0][0] < time - _MAX_FIELD_AGE:
             self._waiting.popleft()
         return next((m_B for t, m_B in reversed(self._waiting) if t <= time), None)
+
+    def calibrated(self, time: float) -> bool:
+        """Return whether the device has calibrated its sensor anew, up to a time [s], once."""
+        calibrated = -math.inf < self._calibrated_at <= time
+        if calibrated:
+            self._calibrated_at = -math.inf
+        return calibrated

@@ -305,4 +305,5 @@ class FrontEnd:
         self._windows.add(table, attitudes, flags)
         window = self._windows.window() if update else None
         R_NB = self._attitude.R_NB
-        return ImuInterval(table, R_NB, update, window, field_B, height, flags=flags)
+        anew = self._fields.calibrated(table[-1, 0])
+        return ImuInterval(table, R_NB, update, window, field_B, height, None, flags, anew)

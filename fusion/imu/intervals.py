@@ -91,6 +91,7 @@ class ImuInterval:
         levelled: attitude from gravity after a gap too long to be bridged, estimated as at the
             first sample; None elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
+        field_anew: whether the device has calibrated its magnetometer anew.
     """
 
     table: FloatArray
@@ -101,6 +102,7 @@ class ImuInterval:
     height: HeightSample | None = None
     levelled: Start | None = None
     flags: Flags = NO_FLAGS
+    field_anew: bool = False
 
     def without_window(self) -> ImuInterval:
         """Return a copy without the window, which an estimator does not need."""

@@ -193,6 +193,17 @@ def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
 
 
+def test_what_a_magnetometer_told_before_it_was_calibrated_anew_is_forgotten(biased_walk, oracle):
+    """As by a phone that is turned and shaken before the walk: its hard iron changes at once."""
+    field, time = biased_walk.magnetometer.field.copy(), biased_walk.magnetometer.time
+    field[time < 8.0] += [40.0, -40.0, 5.0]
+    calibrated = replace(biased_walk, magnetometer=Magnetometer(time, field))
+    after = replace(biased_walk, magnetometer=Magnetometer(time[time >= 8.0], field[time >= 8.0]))
+    tracks = [Navigator(oracle, CONFIG, backend="ekf").run(each) for each in (calibrated, after)]
+    biases, sigma = [t.b_g[-1, 2] for t in tracks], np.sqrt(tracks[1].covariance[-1, 11, 11])
+    assert abs(biases[0] - biases[1]) < 0.3 * sigma
+
+
 @pytest.mark.parametrize("fault", ["axes swapped", "stopped"])
 def test_a_contradicting_field_turns_no_track(biased_walk, oracle, biased_track, fault):
     field, time = biased_walk.magnetometer.field.copy(), biased_walk.magnetometer.time

@@ -168,3 +168,14 @@ def test_a_sensor_that_repeats_its_value_has_stopped():
     used = [buffer.add(0.1 * k, FIELD_B, now=0.1 * k) for k in range(20)]
     assert used == [True] * 6 + [False] * 14  # slow sensors are logged several times
     assert buffer.add(2.0, noisy(1), now=2.0)
+
+
+@pytest.mark.parametrize(("seconds", "calibrated"), [(0.01, True), (0.5, False)])
+def test_only_a_sensor_changes_a_field_within_a_sample(seconds, calibrated):
+    """A magnet that comes near takes as long as a hand."""
+    buffer, told = FieldBuffer(), []
+    for k in range(200):
+        time = 0.02 * k
+        buffer.add(time, noisy(k) + 60.0 * np.clip((time - 2.0) / seconds, 0.0, 1.0), now=time)
+        told.append(buffer.calibrated(time))
+    assert sum(told) == calibrated
