@@ -18,10 +18,10 @@ import math
 import numpy as np
 
 from stario.fusion.filter.ekf_state import EkfState, PressureOffset
-from stario.fusion.filter.jacobians import position_jacobian, velocity_jacobian
+from stario.fusion.filter.jacobians import REPORTED, position_jacobian, velocity_jacobian
 from stario.fusion.filter.kalman import Linear, UpdateResult, update
 from stario.fusion.filter.zero_velocity import ZeroVelocity
-from stario.fusion.imu.barometer import CLIMB_DELAY, HEIGHT_SECONDS, HeightSample
+from stario.fusion.imu.barometer import CLIMB_DELAY, HEIGHT_SECONDS, HeightSample, is_step
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -61,6 +61,22 @@ def with_height(s: EkfState, sample: HeightSample) -> tuple[EkfState, UpdateResu
     blocks = [(0, H), (s.offset_row, np.ones((1, 1)))]
     R = np.array([[sample.sigma**2]])
     return update(s, Linear(np.array([residual]), blocks, R), chi2_quantile(_GATE, 1))
+
+
+def with_step(s: EkfState, sample: HeightSample) -> HeightSample:
+    """Return a height of a known climb with the step of the air, if it is more likely one.
+
+    Accelerometer and speed predict where a climb goes on. Two hypotheses explain what differs:
+    noise of the predicted variance, or a step, whose variance the difference itself tells.
+    """
+    if s.offset is None or not sample.rate or sample.risen:
+        return sample
+    residual, H = _linear(s, sample)
+    s = _propagated(s, s.offset, sample)
+    row = np.zeros(s.covariances.shape[1])
+    row[: H.shape[1]], row[s.offset_row] = H[0], 1.0
+    variance = float(row @ s.covariances[REPORTED] @ row) + sample.sigma**2
+    return sample._replace(stepped=residual) if is_step(residual, variance) else sample
 
 
 def yielding(displacement: WindowDisplacement, rate: float) -> WindowDisplacement:

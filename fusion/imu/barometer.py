@@ -85,6 +85,23 @@ _CORRELATION = 4.0
 over a second."""
 
 
+_STEP_SHARE = 0.025
+"""Share of averages in which the air steps: a door every 20 s."""
+
+
+def is_step(difference: float, variance: float) -> bool:
+    """Return whether a difference of heights [m] is more likely a step of the air than noise.
+
+    Args:
+        difference: to what is expected without a step.
+        variance: that of the difference without a step [m^2].
+    """
+    nis = difference * difference / variance
+    # Likelihoods with variances v and v + d^2, in logarithms.
+    gain = 0.5 * (nis - nis / (1.0 + nis) - math.log1p(nis))
+    return gain > -math.log(_STEP_SHARE)
+
+
 class HeightSample(NamedTuple):
     """An averaged height above the first one, by the pressure.
 

@@ -160,6 +160,19 @@ def test_without_pressures_on_a_climb_its_height_is_as_uncertain_as_it_is(house,
     assert "pressure_silent" in [found.code for found in health_findings(track.health)]
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_a_door_during_a_ride_moves_the_air_and_not_the_track(
+    house, level_oracle, house_track, share
+):
+    """The accelerometer says how fast the lift is: what jumps beside is the air, by 2.5 m here."""
+    barometer, ride = house.sequence.barometer, house_track.health.floors[-1]
+    shut = barometer.time > ride.start + share * (ride.stop - ride.start)
+    air = Barometer(barometer.time, barometer.pressure_hPa + 0.3 * shut)
+    track = Navigator(level_oracle, CONFIG).run(replace(house.sequence, barometer=air))
+    assert climb_error(track, house.sequence) < 1.2
+    assert track.health.floors[-1].after == ride.after
+
+
 def test_floors_are_those_of_the_house(house, house_track):
     found = [(change.after, change.how) for change in house_track.health.floors]
     assert found == [(stay.floor, stay.way) for stay in house.stays[2:]]
