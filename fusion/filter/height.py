@@ -21,7 +21,7 @@ from stario.fusion.filter.ekf_state import EkfState, PressureOffset
 from stario.fusion.filter.jacobians import REPORTED, position_jacobian, velocity_jacobian
 from stario.fusion.filter.kalman import Linear, UpdateResult, update
 from stario.fusion.filter.zero_velocity import ZeroVelocity
-from stario.fusion.imu.barometer import CLIMB_DELAY, HEIGHT_SECONDS, HeightSample, is_step
+from stario.fusion.imu.barometer import HeightSample, is_step
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -47,6 +47,10 @@ _PATH, _STAIRS = 0.08, 0.2
 
 WALKING = 0.4
 """Speed by the network [m/s] above which one walks on stairs, below which one stands in a lift."""
+
+_UNHEARD_SECONDS = 2.0
+"""Time without a height after which it is not known whether one climbs [s]: three are missing, and
+a lift may have risen two metres."""
 
 _GATE = 0.99
 """Probability of the height's chi-square test; outliers are inflated."""
@@ -101,8 +105,8 @@ def yielding(displacement: WindowDisplacement, rate: float) -> WindowDisplacemen
 
 
 def silent(s: EkfState) -> bool:
-    """Return whether there was a pressure, but none for as long as it takes to know a climb."""
-    return s.offset is not None and s.time - s.offset.time > CLIMB_DELAY + HEIGHT_SECONDS
+    """Return whether there was a pressure, but no height for so long that one may climb by now."""
+    return s.offset is not None and s.time - s.offset.time > _UNHEARD_SECONDS
 
 
 def resting_in_lift(measured: ZeroVelocity) -> ZeroVelocity:

@@ -36,6 +36,9 @@ IPIN 2023)."""
 CLIMB_DELAY = 4.0
 """Length of that line [s], and so the longest time before a climb is known to be one."""
 
+SILENT_SECONDS = CLIMB_DELAY + HEIGHT_SECONDS
+"""Time without heights, longer than any doubt, in which nobody knows whether one climbed [s]."""
+
 _MIN_POINTS = 4
 """Number of heights that a line needs."""
 
@@ -192,6 +195,8 @@ class HeightBuffer(TimedBuffer[float]):
         height = altitude - self._first
         same = bool(self._past) and height == self._past[-1][1]
         self._averages = self._averages + 1 if same else 1
+        if same and not self._coarse:  # noise never repeats: the sensor has stopped
+            return None
         if self._past:
             before, from_height = self._past[-1]
             if abs(height - from_height) > FASTEST_LIFT * (time - before):
@@ -222,7 +227,10 @@ class HeightBuffer(TimedBuffer[float]):
             self._doubt = doubt
             return None
         if doubt is not None:
-            return self._explained(sample, *doubt)
+            found = self._explained(sample, *doubt)
+            # Rounding hides which it was: it may be each.
+            each = self._coarse and not found.stepped
+            return found._replace(stepped=found.risen) if each else found
         if line is not None:
             self._learn(line.scatter)
         return sample
@@ -248,6 +256,11 @@ class HeightBuffer(TimedBuffer[float]):
         """That step as a height [m]."""
         ends = np.array([self._pressure - self._step, self._pressure])
         return float(-np.diff(pressure_altitude(ends))[0])
+
+    @property
+    def _coarse(self) -> bool:
+        """Whether heights are rounded by more than a phone's noise."""
+        return self._rounding**2 / 12.0 > _FIRST_SCATTER**2
 
     @property
     def _sigma(self) -> float:
