@@ -204,6 +204,9 @@ class HeightBuffer(TimedBuffer[float]):
         return self._judged(time, height)
 
     def _judged(self, time: float, height: float) -> HeightSample | None:
+        if self._past and time - self._past[-1][0] > CLIMB_DELAY:  # who knows what lies between
+            self._past.clear()
+            self._doubt = None
         usual = median(h for _, h in self._recent(time - HEIGHT_SECONDS)) if self._past else height
         self._past.append((time, height))
         while self._past[0][0] < time - CLIMB_DELAY - _LONGEST_DOUBT:
