@@ -86,7 +86,7 @@ def step(
     if interval.gap or fixes:
         s = changed(s, alternative=None)
     s, segment, accepted, without_yaw = _propagated(s, interval, accel_factor, fixes, config)
-    s = _with_height(s, interval)
+    s, interval = _with_height(s, interval)
     before = s.ekf
     s, zero_velocity = _with_rest(s, interval, config)
     s, before = s.with_correction(before, "rest"), s.ekf
@@ -236,18 +236,19 @@ def _with_fix(
     return s, result
 
 
-def _with_height(s: EstimatorState, interval: ImuInterval) -> EstimatorState:
-    """Update with the height by the pressure, and note whether it climbs."""
+def _with_height(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorState, ImuInterval]:
+    """Update with the height by the pressure, and note whether it climbs and the air stepped."""
     sample = interval.height
     if sample is None:
-        return changed(s, climb_rate=UNKNOWN_RATE) if height.silent(s.ekf) else s
+        return (changed(s, climb_rate=UNKNOWN_RATE) if height.silent(s.ekf) else s), interval
+    sample = height.with_step(s.ekf, sample)
     after, result = height.with_height(s.ekf, sample)
     if s.alternative is not None:
         other, _ = height.with_height(s.alternative.ekf, sample)
         s = changed(s, alternative=changed(s.alternative, ekf=other))
     s = changed(s, ekf=after, climb_rate=sample.rate)
     steps = ["steps"] if sample.stepped else []
-    return s.counted("pressures", *result.outcomes, *steps)
+    return s.counted("pressures", *result.outcomes, *steps), changed(interval, height=sample)
 
 
 def _with_rest(

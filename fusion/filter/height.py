@@ -18,10 +18,10 @@ import math
 import numpy as np
 
 from stario.fusion.filter.ekf_state import EkfState, PressureOffset
-from stario.fusion.filter.jacobians import position_jacobian, velocity_jacobian
+from stario.fusion.filter.jacobians import REPORTED, position_jacobian, velocity_jacobian
 from stario.fusion.filter.kalman import Linear, UpdateResult, update
 from stario.fusion.filter.zero_velocity import ZeroVelocity
-from stario.fusion.imu.barometer import CLIMB_DELAY, HEIGHT_SECONDS, HeightSample
+from stario.fusion.imu.barometer import HeightSample, is_step
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -48,6 +48,10 @@ _PATH, _STAIRS = 0.08, 0.2
 WALKING = 0.4
 """Speed by the network [m/s] above which one walks on stairs, below which one stands in a lift."""
 
+_UNHEARD_SECONDS = 2.0
+"""Time without a height after which it is not known whether one climbs [s]: three are missing, and
+a lift may have risen two metres."""
+
 _GATE = 0.99
 """Probability of the height's chi-square test; outliers are inflated."""
 
@@ -61,6 +65,22 @@ def with_height(s: EkfState, sample: HeightSample) -> tuple[EkfState, UpdateResu
     blocks = [(0, H), (s.offset_row, np.ones((1, 1)))]
     R = np.array([[sample.sigma**2]])
     return update(s, Linear(np.array([residual]), blocks, R), chi2_quantile(_GATE, 1))
+
+
+def with_step(s: EkfState, sample: HeightSample) -> HeightSample:
+    """Return a height of a known climb with the step of the air, if it is more likely one.
+
+    Accelerometer and speed predict where a climb goes on. Two hypotheses explain what differs:
+    noise of the predicted variance, or a step, whose variance the difference itself tells.
+    """
+    if s.offset is None or not sample.rate or sample.risen:
+        return sample
+    residual, H = _linear(s, sample)
+    s = _propagated(s, s.offset, sample)
+    row = np.zeros(s.covariances.shape[1])
+    row[: H.shape[1]], row[s.offset_row] = H[0], 1.0
+    variance = float(row @ s.covariances[REPORTED] @ row) + sample.sigma**2
+    return sample._replace(stepped=residual) if is_step(residual, variance) else sample
 
 
 def yielding(displacement: WindowDisplacement, rate: float) -> WindowDisplacement:
@@ -85,8 +105,8 @@ def yielding(displacement: WindowDisplacement, rate: float) -> WindowDisplacemen
 
 
 def silent(s: EkfState) -> bool:
-    """Return whether there was a pressure, but none for as long as it takes to know a climb."""
-    return s.offset is not None and s.time - s.offset.time > CLIMB_DELAY + HEIGHT_SECONDS
+    """Return whether there was a pressure, but no height for so long that one may climb by now."""
+    return s.offset is not None and s.time - s.offset.time > _UNHEARD_SECONDS
 
 
 def resting_in_lift(measured: ZeroVelocity) -> ZeroVelocity:

@@ -12,13 +12,13 @@ from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias, SamePlace
-from stario.fusion.imu.barometer import CLIMB_DELAY, UNKNOWN_RATE
+from stario.fusion.imu.barometer import CLIMB_DELAY, SILENT_SECONDS, UNKNOWN_RATE
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.lie import UNKNOWN_YAW
 from stario.fusion.values.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
 _UNKNOWN_POSITION = 1e4
@@ -98,7 +98,8 @@ def _with_climbs(records: Sequence[Record]) -> list[Record]:
     """Return the records with measurements that yield to the pressure's vertical speed.
 
     A climb is known from where it began, which the pressure shows later, and by its height; its
-    speed is that about the middle of each window.
+    speed is that about the middle of each window. In a silence nobody knows, nor before
+    a late sensor's first pressure.
     """
     samples = [r.interval.height for r in records if r.interval.height is not None]
     if not samples:
@@ -116,11 +117,22 @@ def _with_climbs(records: Sequence[Record]) -> list[Record]:
         stairs[first : last + 1] = abs(after - before) > _LEAST_CLIMB
     middle = stop - 0.5 * WINDOW_SECONDS
     found = []
-    for record, climbing, known, at in zip(records, climbs, stairs, middle, strict=True):
-        rate = record.climb_rate
+    silent = _silent(np.concatenate([stop[:1], time, stop[-1:]]), stop)
+    for record, climbing, known, at, unheard in zip(
+        records, climbs, stairs, middle, silent, strict=True
+    ):
+        rate = UNKNOWN_RATE if unheard else record.climb_rate
         if rate is not None and climbing:
             rate = _rate(time, height, at) if known else UNKNOWN_RATE
         found.append(record.at_rate(rate))
+    return found
+
+
+def _silent(time: FloatArray, stop: FloatArray) -> BoolArray:
+    """Return which windows that stop then (N,) overlap with a silence between times (M,) [s]."""
+    found = np.zeros(len(stop), dtype=np.bool_)
+    for k in np.flatnonzero(np.diff(time) > SILENT_SECONDS):
+        found |= (stop > time[k]) & (stop < time[k + 1] + WINDOW_SECONDS)
     return found
 
 

@@ -36,6 +36,9 @@ IPIN 2023)."""
 CLIMB_DELAY = 4.0
 """Length of that line [s], and so the longest time before a climb is known to be one."""
 
+SILENT_SECONDS = CLIMB_DELAY + HEIGHT_SECONDS
+"""Time without heights, longer than any doubt, in which nobody knows whether one climbed [s]."""
+
 _MIN_POINTS = 4
 """Number of heights that a line needs."""
 
@@ -55,13 +58,13 @@ _SUDDEN = 0.45
 _LONGEST_DOUBT = 3.0
 """Time [s] after which it must be known."""
 
+_LIFT_ACCELERATION = 1.5
+"""Acceleration of lifts that passengers bear well, at most [m/s^2] (Strakosch: The Vertical
+Transportation Handbook)."""
+
 _NO_DOOR, _STILL_MOVING = 1.2, 0.1
 """Change [m] that is a lift's and no door's, if each of the last three half seconds has moved by
 this share of it: a step falls into two averages at most."""
-
-_CLEAR_STEP = 0.4
-"""Squared residuals about a step, relative to those about the line, below which the air has
-stepped: a door, a ventilator. Whoever climbs slowly must not be mistaken for one."""
 
 _RESOLUTIONS = (1.0, 0.1, 0.01)
 """Steps in which pressures are rounded [hPa]: 8 m, 0.8 m and 8 cm of height."""
@@ -83,6 +86,23 @@ _SCATTER_COUNT = 60
 _CORRELATION = 4.0
 """Variance of a height's noise relative to its scatter about the line: that of phones is correlated
 over a second."""
+
+
+_STEP_SHARE = 0.025
+"""Share of averages in which the air steps: a door every 20 s."""
+
+
+def is_step(difference: float, variance: float) -> bool:
+    """Return whether a difference of heights [m] is more likely a step of the air than noise.
+
+    Args:
+        difference: to what is expected without a step.
+        variance: that of the difference without a step [m^2].
+    """
+    nis = difference * difference / variance
+    # Likelihoods with variances v and v + d^2, in logarithms.
+    gain = 0.5 * (nis - nis / (1.0 + nis) - math.log1p(nis))
+    return gain > -math.log(_STEP_SHARE)
 
 
 class HeightSample(NamedTuple):
@@ -175,6 +195,8 @@ class HeightBuffer(TimedBuffer[float]):
         height = altitude - self._first
         same = bool(self._past) and height == self._past[-1][1]
         self._averages = self._averages + 1 if same else 1
+        if same and not self._coarse:  # noise never repeats: the sensor has stopped
+            return None
         if self._past:
             before, from_height = self._past[-1]
             if abs(height - from_height) > FASTEST_LIFT * (time - before):
@@ -182,12 +204,16 @@ class HeightBuffer(TimedBuffer[float]):
         return self._judged(time, height)
 
     def _judged(self, time: float, height: float) -> HeightSample | None:
-        usual = median(h for _, h in self._past) if self._past else height
+        if self._past and time - self._past[-1][0] > CLIMB_DELAY:  # who knows what lies between
+            self._past.clear()
+            self._doubt = None
+        usual = median(h for _, h in self._recent(time - HEIGHT_SECONDS)) if self._past else height
         self._past.append((time, height))
-        while self._past[0][0] < time - CLIMB_DELAY - 0.5 * HEIGHT_SECONDS:
+        while self._past[0][0] < time - CLIMB_DELAY - _LONGEST_DOUBT:
             self._past.popleft()
-        line = _line(np.array(self._past))
-        climbed, doubt, began = self._climbing, self._doubt, self._past[0]
+        recent = self._recent(time)
+        line = _line(np.array(recent))
+        climbed, doubt = self._climbing, self._doubt
         self._climbing = line is not None and (
             self._is_climb(line, climbed) or self._is_lift(height - usual)
         )
@@ -195,8 +221,8 @@ class HeightBuffer(TimedBuffer[float]):
         known = line is not None and self._rounding < _NO_DOOR
         sample = HeightSample(time, height, self._sigma, 0.0 if known else UNKNOWN_RATE)
         if line is not None and self._climbing:
-            risen = 0.0 if climbed else height - (doubt or began)[1]
-            return sample._replace(rate=line.slope, risen=risen)
+            sample = sample._replace(rate=line.slope)
+            return sample if climbed else self._explained(sample, *(doubt or recent[0]))
         sudden = max(_SUDDEN, 1.5 * self._rounding)
         if doubt is None and abs(height - usual) > sudden and not climbed:
             doubt = time, usual
@@ -204,11 +230,24 @@ class HeightBuffer(TimedBuffer[float]):
             self._doubt = doubt
             return None
         if doubt is not None:
-            by_air = line is not None and line.step_ratio < _CLEAR_STEP
-            return sample._replace(**{"stepped" if by_air else "risen": height - doubt[1]})
+            found = self._explained(sample, *doubt)
+            # Rounding hides which it was: it may be each.
+            each = self._coarse and not found.stepped
+            return found._replace(stepped=found.risen) if each else found
         if line is not None:
             self._learn(line.scatter)
         return sample
+
+    def _recent(self, time: float) -> list[tuple[float, float]]:
+        """Return the heights of the seconds before a time [s] in which a climb shows."""
+        since = time - CLIMB_DELAY - 0.5 * HEIGHT_SECONDS
+        return [each for each in self._past if each[0] >= since] or [self._past[-1]]
+
+    def _explained(self, sample: HeightSample, since: float, before: float) -> HeightSample:
+        """Return a sample with its change since a height as the air's step and what was climbed."""
+        late = [each for each in self._past if each[0] > since - _MIN_POINTS * HEIGHT_SECONDS]
+        step = _air_step(np.array(late), sample.sigma**2)
+        return sample._replace(risen=sample.height - before - step, stepped=step)
 
     @property
     def _step(self) -> float:
@@ -222,6 +261,11 @@ class HeightBuffer(TimedBuffer[float]):
         return float(-np.diff(pressure_altitude(ends))[0])
 
     @property
+    def _coarse(self) -> bool:
+        """Whether heights are rounded by more than a phone's noise."""
+        return self._rounding**2 / 12.0 > _FIRST_SCATTER**2
+
+    @property
     def _sigma(self) -> float:
         # n equal averages share one error of rounding: sum of 1 / (k (k + 1)) up to n is below 1.
         rounded = self._rounding**2 / 12.0 * self._averages * (self._averages + 1)
@@ -232,14 +276,17 @@ class HeightBuffer(TimedBuffer[float]):
             return abs(line.slope) > _STILL_CLIMBING
         # Over n heights at equal steps the slope's sigma is the mean's times sqrt(12) / span.
         variance = _CORRELATION * self._variance + self._rounding**2 / 12.0
-        sigma = math.sqrt(12.0 * variance / len(self._past)) / CLIMB_DELAY
+        sigma = math.sqrt(12.0 * variance / len(self._recent(self._past[-1][0]))) / CLIMB_DELAY
         least = max(MIN_CLIMB_RATE, _CLIMB_SIGMAS * sigma)
         return abs(line.slope) > least and line.step_ratio > 1.0
 
     def _is_lift(self, change: float) -> bool:
-        last = np.array([height for _, height in self._past])[-_MIN_POINTS:]
-        moved = np.diff(last) * math.copysign(1.0, change)
-        return abs(change) > _NO_DOOR and bool(moved.min() > _STILL_MOVING * abs(change))
+        time, height = np.array(self._past)[-_MIN_POINTS:].T
+        moved = np.diff(height) * math.copysign(1.0, change)
+        if abs(change) < _NO_DOOR or moved.min() < _STILL_MOVING * abs(change):
+            return False
+        beyond = np.abs(np.diff(moved)).max() - _LIFT_ACCELERATION * np.diff(time).max() ** 2
+        return not is_step(max(0.0, float(beyond)), 6.0 * self._variance + self._rounding**2 / 2.0)
 
     def _learn(self, scatter: float) -> None:
         self._count = min(self._count + 1, _SCATTER_COUNT)
@@ -260,3 +307,28 @@ def _line(past: FloatArray) -> _Line | None:
     explained = float((total**2 / k + total**2 / (n - k)).max())
     ratio = (float(y @ y) - explained) / max(about_line, 1e-9)
     return _Line(slope, math.sqrt(about_line / (n - 2)), ratio)
+
+
+def _air_step(past: FloatArray, variance: float) -> float:
+    """Return the step [m] by which the air changed within heights (n, 2); 0 if none is likely.
+
+    Who begins to climb changes the speed, a door the height: heights are fitted with a change of
+    speed anywhere, and with a step anywhere beside it. The average into which a step falls is free.
+    """
+    n = len(past)
+    if n < 2 * _MIN_POINTS:
+        return 0.0
+    t, y = (past - past[0]).T
+    at, bend = (k.ravel() for k in np.meshgrid(np.arange(2, n - 2), np.arange(n - 2)))
+    k = np.arange(n)
+    columns = [np.ones((len(at), n)), np.maximum(t - t[bend, None], 0.0), k == at[:, None]]
+    columns.append(k > at[:, None])
+    q, r = np.linalg.qr(np.stack(columns, axis=2))
+    along = np.einsum("mnk,n->mk", q, y)
+    left = y @ y - np.square(along).sum(axis=1)
+    best = int(left.argmin())
+    if left[best] > n * variance:  # a puff of air, for instance
+        return 0.0
+    step = float(along[best, 3] / r[best, 3, 3])
+    without = (left + np.square(along[:, 3]))[at == at[best]].min()
+    return step if is_step(step, step**2 * variance / max(without - left[best], 1e-12)) else 0.0

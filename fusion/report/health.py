@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 from stario.fusion.filter.innovations import USUAL_LEVEL
+from stario.fusion.imu.barometer import SILENT_SECONDS
 from stario.fusion.imu.front_end import BRIDGED
 from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.values.health import Health
@@ -34,9 +35,9 @@ _RESTING = 100
 NIS_RATIO = 2.0
 """Factor between mean NIS and expectation, in either direction, above which to report it."""
 
-_LATE_S, _FIELDS_DROPPED, _SILENT_S = 0.5, 50, 10.0
+_LATE_S, _FIELDS_DROPPED, _SILENT_S = 0.5, 50, SILENT_SECONDS
 """Late samples in a row [s], dropped magnetic fields, and time without a pressure [s], beyond which
-to tell of them: a floor's stairs take ten seconds."""
+to tell of them: a lift may have passed a floor."""
 
 TURNED_RAD = math.radians(45.0)
 """Turn of the network's direction, beyond three sigmas, that is reported [rad]: half of a quarter

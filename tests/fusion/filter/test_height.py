@@ -160,6 +160,40 @@ def test_without_pressures_on_a_climb_its_height_is_as_uncertain_as_it_is(house,
     assert "pressure_silent" in [found.code for found in health_findings(track.health)]
 
 
+@pytest.mark.parametrize("kind", ["late", "silent", "stuck"])
+def test_what_the_barometer_did_not_hear_of_a_ride_is_uncertain(
+    house, level_oracle, house_track, kind
+):
+    """Late, silent, or stuck in a lift: nobody knows whether one climbs, and sigma says so."""
+    air, ride = house.sequence.barometer, house_track.health.floors[-1]
+    middle = 0.5 * (ride.start + ride.stop)
+    start, stop = {"late": (0.0, ride.stop)}.get(kind, (middle - 3.0, middle + 3.0))
+    unheard = (air.time > start) & (air.time < stop)
+    if kind == "stuck":
+        pressures = np.where(unheard, air.pressure_hPa[unheard][0], air.pressure_hPa)
+        air = Barometer(air.time, pressures)
+    else:
+        air = Barometer(air.time[~unheard], air.pressure_hPa[~unheard])
+    track = Navigator(level_oracle, CONFIG).run(replace(house.sequence, barometer=air))
+    error = track.trajectory.position_W[:, 2]
+    error = error - house.sequence.truth.at(track.time).position_W[:, 2]
+    sigma = np.sqrt(track.covariance[:, 8, 8])
+    assert np.all(np.abs(error - error[0]) < 4.0 * sigma + 0.2)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_a_door_during_a_ride_moves_the_air_and_not_the_track(
+    house, level_oracle, house_track, share
+):
+    """The accelerometer says how fast the lift is: what jumps beside is the air, by 2.5 m here."""
+    barometer, ride = house.sequence.barometer, house_track.health.floors[-1]
+    shut = barometer.time > ride.start + share * (ride.stop - ride.start)
+    air = Barometer(barometer.time, barometer.pressure_hPa + 0.3 * shut)
+    track = Navigator(level_oracle, CONFIG).run(replace(house.sequence, barometer=air))
+    assert climb_error(track, house.sequence) < 1.2
+    assert track.health.floors[-1].after == ride.after
+
+
 def test_floors_are_those_of_the_house(house, house_track):
     found = [(change.after, change.how) for change in house_track.health.floors]
     assert found == [(stay.floor, stay.way) for stay in house.stays[2:]]
