@@ -84,7 +84,8 @@ def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, se
 def test_height_and_floor_of_a_phone_with_a_barometer_are_shown(show, server, replay):
     walk = demonstration()
     height = np.interp(walk.time - walk.time[0], [5.0, 15.0], [0.0, 3.0])
-    air = Barometer(walk.time[::10], 1000.0 - height[::10] / METRES_PER_HPA)
+    noise = 0.01 * np.random.default_rng(1).standard_normal(len(height))
+    air = Barometer(walk.time[::10], (1000.0 + noise - height / METRES_PER_HPA)[::10])
     url = f"http://127.0.0.1:{server.port}"
     replay(replace(walk, barometer=air), f"{url}/data", 10.0, 22.0, "emil")
     shown = show(url)

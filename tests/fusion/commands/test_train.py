@@ -47,6 +47,7 @@ def test_weights_that_train_writes_can_be_run(stario, recording, tmp_path, tiny)
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_a_training_that_is_stopped_says_how_to_go_on(stario, monkeypatch, tiny, stop):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs inherit none
     monkeypatch.setattr("stario.network.training.train.train", lambda *_: signal.raise_signal(stop))
     done = stario("train", "--generated", 1, "--config", tiny, "--out", "stopped")
     assert done.code != 0

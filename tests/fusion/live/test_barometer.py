@@ -21,7 +21,8 @@ def climb(time: float) -> float:
 
 
 def pressure(time: float) -> dict[str, float]:
-    return {"pressure": 950.0 - climb(time) / METRES_PER_HPA, "relativeAltitude": 99.0}
+    ripple = 0.005 * np.sin(99.0 * time)  # a sensor without noise has stopped
+    return {"pressure": 950.0 + ripple - climb(time) / METRES_PER_HPA, "relativeAltitude": 99.0}
 
 
 def place(time: float) -> dict[str, float | None]:
