@@ -288,7 +288,10 @@ def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorSt
         reference, before = s.magnetic, s.ekf
     if m_B is None or not reference.is_due(interval.stop, before):
         return s, None
+    m_B = m_B - reference.offset_B
     after, result, updated = magnetic.update_bearing(before, reference, m_B)
+    if updated.rotation.is_uncalibrated:
+        return changed(s.both(magnetic.without_field), magnetic=updated.calibrated()), None
     if s.alternative is not None:
         other, *_ = magnetic.update_bearing(s.alternative.ekf, reference, m_B)
         s = changed(s, alternative=changed(s.alternative, ekf=other))

@@ -108,6 +108,7 @@ class MagneticReference:
             field's, which the device had not followed.
         rotation: how the field has changed while the device rotated.
         pose: attitude R_WB (3, 3) and position p_W (3,) [m] at the last bearing.
+        offset_B: (3,) hard iron that no calibration has removed; bearings are without it [uT].
     """
 
     time: float = -math.inf
@@ -120,6 +121,7 @@ class MagneticReference:
     held: bool = False
     rotation: FieldRotation = field(default_factory=FieldRotation)
     pose: tuple[FloatArray, FloatArray] | None = None
+    offset_B: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def disturbance_sigma(self) -> float:
@@ -133,6 +135,11 @@ class MagneticReference:
         return math.hypot(
             (size / self.size - 1.0) / _SIZE_TOLERANCE, (dip - self.dip) / _DIP_TOLERANCE
         )
+
+    def calibrated(self) -> MagneticReference:
+        """Return the reference at the start of fields without the hard iron found so far."""
+        offset_B = self.offset_B + self.rotation.iron_B
+        return MagneticReference(rotation=self.rotation.calibrated(), offset_B=offset_B)
 
     def is_due(self, time: float, s: EkfState) -> bool:
         """Return whether a bearing may be applied at a time [s] to a state.

@@ -193,6 +193,21 @@ def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
 
 
+@pytest.mark.parametrize("iron", [[50.0, 0.0, 0.0], [-120.0, 200.0, 590.0]])
+def test_a_magnetometer_that_was_never_calibrated_tells_the_bias_all_the_same(
+    biased_walk, oracle, iron
+):
+    """A device in a hand turns enough to tell its hard iron, whatever its size."""
+    field = biased_walk.magnetometer
+    shifted = replace(biased_walk, magnetometer=replace(field, field=field.field + iron))
+    track = Navigator(oracle, CONFIG, backend="ekf").run(shifted)
+    blind = Navigator(oracle, CONFIG, backend="ekf").run(replace(biased_walk, magnetometer=None))
+    error = abs(track.b_g[-1, 2] - 0.006)
+    assert error < 3.0 * np.sqrt(track.covariance[-1, 11, 11])
+    assert error < 0.8 * abs(blind.b_g[-1, 2] - 0.006)
+    assert track.health.bearings["applied"] > 150
+
+
 def test_what_a_magnetometer_told_before_it_was_calibrated_anew_is_forgotten(biased_walk, oracle):
     """As by a phone that is turned and shaken before the walk: its hard iron changes at once."""
     field, time = biased_walk.magnetometer.field.copy(), biased_walk.magnetometer.time
