@@ -65,8 +65,9 @@ def _smoothed_states(
     """
     last, states = filtered.last, nav_states(filtered.estimates, GAIN)
     frame, end, covariance = last.map_frame, states[-1], states[0].covariance.copy()
-    has_field = last.ekf.field is not None
-    bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if has_field else None
+    # Without bearings the filter knows of the bias what the graph knows itself.
+    told = last.counts.bearings.get("applied", 0) > 0
+    bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if told else None
     # The filter's last prior.
     covariance[GYRO_BIAS, GYRO_BIAS] = last.bias_prior.variance * np.eye(3)
     first = replace(states[0], covariance=covariance)

@@ -266,6 +266,17 @@ def test_a_field_in_another_unit_is_named_as_such(biased_walk, make_oracle, scal
     assert named in reason
 
 
+def test_a_field_that_tells_nothing_makes_no_track_surer(biased_walk, make_oracle):
+    walk = biased_walk.slice(0.0, 30.0)
+    in_gauss = replace(walk.magnetometer, field=0.01 * walk.magnetometer.field)
+    sigmas = []
+    for magnetometer in (None, in_gauss):
+        oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+        track = Navigator(oracle, CONFIG).run(replace(walk, magnetometer=magnetometer))
+        sigmas.append(track.health.final_sigma["yaw_rad"])
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.01)
+
+
 def test_a_disabled_magnetometer_has_no_effect(biased_walk, make_oracle):
     short = biased_walk.slice(0.0, 6.0)
     off = replace(CONFIG, filter=replace(CONFIG.filter, magnetometer=False))
