@@ -41,7 +41,7 @@ from stario.fusion.imu.units import SensorCheck, warn_of_field
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.health import Health
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
-from stario.sequences.clean_samples import replace_spikes
+from stario.sequences.clean_samples import MAX_RATE, replace_spikes
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, FAR_AHEAD, MAX_IMU_GAP
@@ -224,14 +224,22 @@ class FrontEnd:
         counts.longest_gap = max(counts.longest_gap, length)
         counts.gaps = [*counts.gaps, (start, length)][-_GAPS_LISTED:]
 
-    def _check_time_unit(self) -> None:
-        """Refuse a stream in which every sample so far is isolated by gaps."""
-        isolated = self.counts.gap_count
-        if isolated >= _ISOLATED_SAMPLES and self.counts.samples["used"] == isolated + 1:
+    def _check_times(self, before: list[Sample]) -> None:
+        """Refuse a stream in which every sample so far is isolated by gaps, or batches are."""
+        gaps, count = self.counts.gap_count, len(before)
+        if gaps < _ISOLATED_SAMPLES or self._attitude is not None:
+            return
+        if self.counts.samples["used"] == gaps + 1:
             step = statistics.median(length for _, length in self.counts.gaps)
             raise InputError(
                 "time", f"samples {step:.3g} s apart", "50 to 1000 per second", "give times in s"
             )
+        if count > 1 and before[-1][0] - before[0][0] < (count - 1) / MAX_RATE:
+            found = (
+                f"batches of {count} samples at {before[0][0]:.10g} s and {gaps - 1} other times"
+            )
+            fix = "these are the times at which batches arrived: space their samples evenly"
+            raise InputError("time", found, "a time for each sample", fix)
 
     def _check_time_advances(self, time: float) -> None:
         """Refuse a stream that only repeats its first time, as seconds since 1970 in float32 do."""
@@ -245,7 +253,7 @@ class FrontEnd:
         """End the current interval; `_begin` spans the gap since `start` with one of its own."""
         before = self._samples
         self._samples = [sample]
-        self._check_time_unit()
+        self._check_times(before)
         self._windows.clear()
         self._next = -math.inf
         if self._attitude is None or self._before_gap is not None:

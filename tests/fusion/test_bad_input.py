@@ -61,6 +61,7 @@ def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
         (lambda time: 1.7e18 + 1e9 * time, "give times in s"),
         (lambda time: 100.0 * time, "give times in s"),
         (lambda time: (time + 1.7e9).astype(np.float32), "64 bits"),  # in which they repeat
+        (lambda time: 0.4 * (time // 0.4) + 1e-3 * (time % 0.4), "space their samples evenly"),
     ],
 )
 def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, change, remedy):
