@@ -284,20 +284,25 @@ def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorSt
     """Update with the magnetic field; return what it told about attitude and bias, too."""
     m_B, reference, before = interval.field_B, s.magnetic, s.ekf
     if interval.field_anew and not reference.held:
-        s = changed(s.both(magnetic.without_field), magnetic=magnetic.MagneticReference())
+        s = _with_field_anew(s, magnetic.MagneticReference())
         reference, before = s.magnetic, s.ekf
     if m_B is None or not reference.is_due(interval.stop, before):
         return s, None
     m_B = m_B - reference.offset_B
     after, result, updated = magnetic.update_bearing(before, reference, m_B)
     if updated.rotation.is_uncalibrated:
-        return changed(s.both(magnetic.without_field), magnetic=updated.calibrated()), None
+        return _with_field_anew(s, updated.calibrated()), None
     if s.alternative is not None:
         other, *_ = magnetic.update_bearing(s.alternative.ekf, reference, m_B)
         s = changed(s, alternative=changed(s.alternative, ekf=other))
     updated = changed(updated, pose=(after.R_WB, after.p_W))
     s = changed(s, ekf=after, magnetic=updated).counted("bearings", *result.outcomes)
     return s, gained_information(before, after)
+
+
+def _with_field_anew(s: EstimatorState, reference: magnetic.MagneticReference) -> EstimatorState:
+    """Begin with the field anew: what it told has another hard iron."""
+    return changed(s.both(magnetic.without_field), magnetic=reference)
 
 
 def _with_north(

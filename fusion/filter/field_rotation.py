@@ -37,9 +37,9 @@ _ANY_IRON, _IRON_WALK = 300.0, 2.0
 """Sigma per axis of a hard iron that no calibration has removed [uT], and how it walks
 [uT/sqrt(s)]: phones calibrate anew as they are carried."""
 
-_LEFT_IRON, _PROBABILITY = 10.0, 0.999
-"""Sigma per axis of what a calibration leaves [uT], and the probability of the chi-square test by
-which more than that is left."""
+HARD_IRON_SIGMA, _PROBABILITY = 10.0, 0.999
+"""Sigma of the hard iron that a phone's calibration leaves, per axis [uT], and the probability of
+the chi-square test by which more than that is left."""
 
 _FREEDOM = 3.0
 """Degrees of freedom of the Student-t distribution of fields' changes: steel is common."""
@@ -71,7 +71,7 @@ class FieldRotation:
     @property
     def is_uncalibrated(self) -> bool:
         """Whether the hard iron is clearly more than a calibration leaves."""
-        S = self.iron_P + _LEFT_IRON**2 * np.eye(3)
+        S = self.iron_P + HARD_IRON_SIGMA**2 * np.eye(3)
         return float(self.iron_B @ np.linalg.solve(S, self.iron_B)) > chi2_quantile(_PROBABILITY, 3)
 
     def calibrated(self) -> FieldRotation:

@@ -22,7 +22,7 @@ import numpy as np
 
 from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
-from stario.fusion.filter.field_rotation import FieldRotation
+from stario.fusion.filter.field_rotation import HARD_IRON_SIGMA, FieldRotation
 from stario.fusion.filter.kalman import UpdateResult, gauss_markov
 from stario.fusion.imu.intervals import SAME_TIME
 from stario.fusion.values.fixes import Fix, yaw_fix
@@ -36,10 +36,9 @@ DISTURBANCE_METRES, DISTURBANCE_SECONDS = 5.0, 60.0
 """Distance [m] and time [s] over which the disturbance decorrelates: the reach of a beam or a
 radiator, and the duration of other changes."""
 
-HARD_IRON_SIGMA, HARD_IRON_SECONDS = 10.0, 60.0
-"""Sigma of the hard iron that a phone's calibration leaves, per axis [uT], and the time over which
-it decorrelates [s]: phones calibrate their magnetometer anew as they are carried, by up to 30 uT at
-once (IPIN 2023, Trial01_1), so that what it was a minute ago tells little."""
+HARD_IRON_SECONDS = 60.0
+"""Time over which a calibration's hard iron decorrelates [s]: phones calibrate their magnetometer
+anew as they are carried, so that what it was a minute ago tells little."""
 
 BEARING_SIGMA = 0.3
 """White noise of one bearing [rad] where the disturbance's sigma is at its largest, elsewhere in

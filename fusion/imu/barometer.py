@@ -59,8 +59,7 @@ _LONGEST_DOUBT = 3.0
 """Time [s] after which it must be known."""
 
 _LIFT_ACCELERATION = 1.5
-"""Acceleration of lifts that passengers bear well, at most [m/s^2] (Strakosch: The Vertical
-Transportation Handbook)."""
+"""Acceleration that no passenger lift exceeds [m/s^2]."""
 
 _NO_DOOR, _STILL_MOVING = 1.2, 0.1
 """Change [m] that is a lift's and no door's, if each of the last three half seconds has moved by
@@ -86,7 +85,6 @@ _SCATTER_COUNT = 60
 _CORRELATION = 4.0
 """Variance of a height's noise relative to its scatter about the line: that of phones is correlated
 over a second."""
-
 
 _STEP_SHARE = 0.025
 """Share of averages in which the air steps: a door every 20 s."""
@@ -215,7 +213,7 @@ class HeightBuffer(TimedBuffer[float]):
         line = _line(np.array(recent))
         climbed, doubt = self._climbing, self._doubt
         self._climbing = line is not None and (
-            self._is_climb(line, climbed) or self._is_lift(height - usual)
+            self._is_climb(line, len(recent), climbed) or self._is_lift(height - usual)
         )
         self._doubt = None
         known = line is not None and self._rounding < _NO_DOOR
@@ -271,12 +269,12 @@ class HeightBuffer(TimedBuffer[float]):
         rounded = self._rounding**2 / 12.0 * self._averages * (self._averages + 1)
         return math.sqrt(_CORRELATION * self._variance + rounded)
 
-    def _is_climb(self, line: _Line, climbed: bool) -> bool:
+    def _is_climb(self, line: _Line, count: int, climbed: bool) -> bool:
         if climbed:
             return abs(line.slope) > _STILL_CLIMBING
-        # Over n heights at equal steps the slope's sigma is the mean's times sqrt(12) / span.
+        # Over heights at equal steps the slope's sigma is the mean's times sqrt(12) / span.
         variance = _CORRELATION * self._variance + self._rounding**2 / 12.0
-        sigma = math.sqrt(12.0 * variance / len(self._recent(self._past[-1][0]))) / CLIMB_DELAY
+        sigma = math.sqrt(12.0 * variance / count) / CLIMB_DELAY
         least = max(MIN_CLIMB_RATE, _CLIMB_SIGMAS * sigma)
         return abs(line.slope) > least and line.step_ratio > 1.0
 

@@ -54,7 +54,8 @@ _HOLE_SECONDS = 0.05
 """A time step longer than this [s] is a hole: the motion within it is poorly known."""
 
 _ISOLATED_SAMPLES = 20
-"""This many samples in a row, each isolated by gaps, show that times are not in seconds."""
+"""This many samples in a row, each isolated by gaps, show that times are not in seconds; this many
+batches, that they are those of arrival."""
 
 _REPEATED_SAMPLES = 1000
 """This many samples with the first one's time show that times have too few digits."""

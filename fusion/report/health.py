@@ -35,9 +35,8 @@ _RESTING = 100
 NIS_RATIO = 2.0
 """Factor between mean NIS and expectation, in either direction, above which to report it."""
 
-_LATE_S, _FIELDS_DROPPED, _SILENT_S = 0.5, 50, SILENT_SECONDS
-"""Late samples in a row [s], dropped magnetic fields, and time without a pressure [s], beyond which
-to tell of them: a lift may have passed a floor."""
+_LATE_S, _FIELDS_DROPPED = 0.5, 50
+"""Late samples in a row [s], and dropped magnetic fields, beyond which to tell of them."""
 
 TURNED_RAD = math.radians(45.0)
 """Turn of the network's direction, beyond three sigmas, that is reported [rad]: half of a quarter
@@ -224,7 +223,7 @@ def _corrections(health: Health) -> Iterator[Finding]:
 
 def _floors(health: Health) -> Iterator[Finding]:
     start, seconds = health.pressure_silence
-    if seconds > _SILENT_S:
+    if seconds > SILENT_SECONDS:  # a lift may have passed a floor
         text = (
             f"The barometer told nothing for {seconds:.0f} s from {start:.0f} s on: there is no "
             "pressure, or the same one again and again."

@@ -13,11 +13,11 @@ from told import health_lines
 
 from stario.fusion import Navigator, PriorPose, position_fix, yaw_fix
 from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.field_rotation import HARD_IRON_SIGMA
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import (
     DISTURBANCE_SIGMA,
     HARD_IRON_SECONDS,
-    HARD_IRON_SIGMA,
     MagneticReference,
     propagated_field,
     update_bearing,
