@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.filter import estimator
+from stario.fusion.filter.ekf_state import LOST_YAW
 from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_unknown_yaws
@@ -74,6 +75,7 @@ def _smoothed_states(
     final = to_final_frame(states, frame.transforms)
     try:
         solved = smooth(final, first, filtered.records, frame, config, bias)
+        _check_heading(solved[-1], states[-1])
     except IndeterminateError as error:
         return filtered.states(), [f"graph fell back to the filter's track: {error}"]
     turns = [
@@ -82,6 +84,17 @@ def _smoothed_states(
     ]
     solved = with_reported_covariances(solved, filtered.estimates, np.array(turns))
     return with_unknown_yaws(solved, frame.unknown_yaws), []
+
+
+def _check_heading(solved: NavState, filtered: NavState) -> None:
+    """Check that the graph's heading is known if the filter's is, with the magnetic field.
+
+    Raises:
+        IndeterminateError: it is lost.
+    """
+    if solved.covariance[2, 2] > LOST_YAW**2 > filtered.covariance[2, 2]:
+        sigma = math.degrees(math.sqrt(filtered.covariance[2, 2]))
+        raise IndeterminateError(f"it lost the heading, which the filter knows to {sigma:.0f} deg")
 
 
 def _doubts_of_closure(filtered: Sequence[NavState]) -> list[str]:

@@ -16,6 +16,7 @@ from stario.fusion import Navigator, NavState, SmoothedPose, position_fix
 from stario.fusion.values.state import MAX_STEP, advanced
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.simulation.magnetometer import MagneticField, simulate_magnetometer
 
 
 def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
@@ -211,3 +212,16 @@ def test_returned_arrays_may_be_overwritten(walk, make_oracle):
         ends.append((navigator.state.p_W, navigator.state.b_g, navigator.continuous.p_W))
     for clean, written in zip(*ends, strict=True):
         np.testing.assert_array_equal(clean, written)
+
+
+def test_a_heading_that_the_field_alone_tells_is_not_lost(walks):
+    walk, model = walks[0]
+    noisy = replace(CONFIG, noise=replace(CONFIG.noise, gyro_noise=0.3))
+    navigator = Navigator(model, noisy)
+    alone = navigator.run(walk)
+    assert alone.covariance[-1, 2, 2] > 1.0
+    assert alone.health.notes == []
+    magnetometer = simulate_magnetometer(walk.truth, MagneticField())
+    track = navigator.run(replace(walk, magnetometer=magnetometer))
+    assert track.covariance[-1, 2, 2] < 0.5
+    assert any("heading" in note for note in track.health.notes)
