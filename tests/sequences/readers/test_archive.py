@@ -1,5 +1,3 @@
-"""Archives: recordings by name, the three kinds of ground truth, missing entries."""
-
 import fcntl
 from pathlib import Path
 
@@ -113,15 +111,6 @@ def test_other_groups_and_attributes_are_passed_over(tmp_path):
     assert len(find_recordings(path)) == 3
     with pytest.raises(ReadError, match="imu/accel: found no such dataset"):
         read_recording(f"{path}:b")
-
-
-@pytest.mark.parametrize("datasets", [[], ["data"], ["a", "b"]])
-def test_a_file_without_recordings_says_so(tmp_path, datasets):
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file.update({name: np.zeros((5, 7)) for name in datasets})
-    for name in ("other.h5", "other.h5:a"):
-        with pytest.raises(ReadError, match="recordings: found no group, expected one for each"):
-            read_recording(tmp_path / name, format="archive")
 
 
 @pytest.mark.skipif(not ARCHIVES.is_dir(), reason="the development recordings are not here")

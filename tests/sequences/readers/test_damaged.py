@@ -1,5 +1,3 @@
-"""Damaged files raise a one-line error that names them, whatever is wrong with them."""
-
 import shutil
 import zipfile
 from contextlib import suppress

@@ -1,5 +1,3 @@
-"""Recordings found below a path: what is one, what is a list of them, and what is passed over."""
-
 from pathlib import Path
 
 import pytest

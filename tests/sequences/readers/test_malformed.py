@@ -1,5 +1,3 @@
-"""Unreadable files raise a one-line error with file, field, found and expected."""
-
 import json
 import pickle
 import re

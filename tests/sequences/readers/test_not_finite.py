@@ -1,5 +1,3 @@
-"""Samples that are not finite are left out with a warning; a file is refused if most are."""
-
 import re
 import struct
 from collections.abc import Callable

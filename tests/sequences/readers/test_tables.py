@@ -1,5 +1,3 @@
-"""Tables of text: their heads, ragged rows, rows of one sensor alone, zeros and clocks."""
-
 import numpy as np
 import pytest
 from csv_lines import write_lines

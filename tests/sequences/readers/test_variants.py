@@ -1,5 +1,3 @@
-"""What a format leaves open: attitude sources, quaternion orders, frames, topics, clocks."""
-
 import json
 import sys
 

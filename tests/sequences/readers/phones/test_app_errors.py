@@ -1,5 +1,3 @@
-"""Files and zips that no reader of phone apps takes are refused in one line that names why."""
-
 import zipfile
 
 import numpy as np

@@ -1,9 +1,6 @@
-"""What phone apps' exports tell and do not: rates, signs, attitude, clocks."""
-
 import numpy as np
 import pytest
 from alike import assert_same_samples
-from csv_lines import write_lines
 from phone_exports import export, ns, save
 
 from stario.sequences import InputError, check_units, read_recording, with_conventions
@@ -55,17 +52,6 @@ def test_lines_of_an_attitude_that_cannot_be_read_cost_no_recording(walk, tmp_pa
     path = tmp_path / "log.txt"
     path.write_text(path.read_text().replace(";1;2;3;", ";1;2;"))
     assert read_recording(path).device_attitude is None
-
-
-def test_a_file_in_g_is_named_by_its_own_name_and_read_without_advice_on_options(tmp_path, caplog):
-    """`check_units` asks for the options, and only if they were not given."""
-    sensors = ("gravity", "rotationRate", "userAcceleration")
-    titles = ",".join(["timestamp", *(f"{name}.{axis}" for name in sensors for axis in "xyz")])
-    rows = [f"{0.01 * k:.2f},0,0,-1,0,0,0,0,0,{0.01 * (k % 3)}" for k in range(200)]
-    with caplog.at_level("INFO"):
-        read_recording(write_lines(tmp_path / "walk.csv", titles, *rows))
-    assert "walk.csv: added gravity" in caplog.text
-    assert "--accel-unit" not in caplog.text
 
 
 @pytest.mark.parametrize("second_clock", [False, True])

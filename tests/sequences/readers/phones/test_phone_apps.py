@@ -30,13 +30,6 @@ def test_an_apps_export_is_read_as_the_walk(app, walk, tmp_path):
         np.testing.assert_allclose(read.magnetometer.time, walk.time, atol=1e-3)
 
 
-def test_old_unit_symbols_are_read(walk, tmp_path):
-    export("androsensor", tmp_path / "s", walk)
-    (path,) = (tmp_path / "s").iterdir()
-    path.write_bytes(path.read_text().replace("μ", "µ").encode("latin-1"))
-    np.testing.assert_allclose(read_recording(path).accel, walk.accel)
-
-
 def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(walk, tmp_path):
     """Its norm is about 1, as in g; the gravity file next to it shows what it is."""
     export("sensor_logger_ios", tmp_path / "s", walk)
