@@ -1,5 +1,3 @@
-"""The report loads without a network, names units, and its slider moves every cursor."""
-
 import re
 from dataclasses import replace
 from functools import cache
@@ -171,7 +169,6 @@ def test_report_of_a_run_without_truth_has_no_table(tmp_path, comparison):
 def test_a_map_server_is_asked_on_request_and_points_have_their_place(
     show, tile_server, comparison, tmp_path
 ):
-    """The track's own x axis points north; the map is drawn with north up."""
     place = Georeference(48.1, 11.5, np.radians(90.0))
     track = replace(comparison.track, georeference=place)
     sequence = replace(comparison.sequence, truth=None)

@@ -1,5 +1,3 @@
-"""Simulated walks, and predictors of their true displacements or of none."""
-
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -87,8 +85,6 @@ class Oracle:
 
 
 class Still:
-    """Predicts zero displacement for every window, with a sigma of 1 m per axis."""
-
     def predict(self, windows):
         n = len(windows)
         return np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))

@@ -1,5 +1,3 @@
-"""Wrong arguments are refused at once, by name."""
-
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial

@@ -1,5 +1,3 @@
-"""The navigator on real recordings, where they are available."""
-
 import numpy as np
 import pytest
 from recorded import DATA

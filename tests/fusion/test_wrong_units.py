@@ -1,5 +1,3 @@
-"""Recordings and streams in wrong units are refused by name, with what fixes them."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -100,7 +98,6 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(make_walk, st
 
 
 def starts_and_stops(gyro: np.ndarray) -> ImuSequence:
-    """Shaken for six seconds and calm for six, in turn."""
     time = 0.01 * np.arange(4800)
     shaken = np.where(time % 12.0 < 6.0, np.sin(6.0 * time), 0.0)
     accel = np.array([0.0, 0.0, STANDARD_GRAVITY]) + np.outer(shaken, [0.5, 1.0, 2.0])

@@ -1,5 +1,3 @@
-"""Times: order of samples, and even grids."""
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,5 +1,3 @@
-"""The commands that write recordings and networks: convert, simulate and export."""
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The commands for many recordings: compare, evaluate and the checks."""
-
 import json
 import re
 from dataclasses import fields, replace

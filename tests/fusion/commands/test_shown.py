@@ -1,5 +1,3 @@
-"""`run --report`, `run --view`, `compare --report` and `live` as users call them."""
-
 import json
 import logging
 import socket

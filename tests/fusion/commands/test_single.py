@@ -1,5 +1,3 @@
-"""The `stario` command as a user meets it: output, files, exit codes, one-line errors."""
-
 import html
 import json
 import re

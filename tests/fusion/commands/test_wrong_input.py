@@ -1,5 +1,3 @@
-"""Wrong input to the commands: one line that names what is wrong and what fixes it."""
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Intervals of error ratios and ranks: their width, what is drawn, and the verdict on them."""
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +14,6 @@ Errors = dict[tuple[str, str, str], np.ndarray]
 
 
 def table_of(networks: dict[str, list[Errors]]) -> pd.DataFrame:
-    """Errors of networks, by seed."""
     return joined(
         pd.DataFrame({"squares": squares, "count": 1.0, "block": range(len(squares))}).assign(
             set=s, group=group, recording=name, network=network, seed=seed,
@@ -45,7 +42,6 @@ def interval_of(pairs: Sequence[tuple[Any, Any]], groups: Sequence[str] | None =
 
 
 def recordings(ratios: Sequence[float]) -> list[tuple[Any, Any]]:
-    """A recording of five blocks for each ratio of errors."""
     theirs = np.random.default_rng(0).uniform(1.0, 2.0, (len(ratios), 5))
     return [(ratio**2 * blocks, blocks) for ratio, blocks in zip(ratios, theirs, strict=True)]
 

@@ -1,5 +1,3 @@
-"""Comparison of tracks, and folders of results, which replace earlier ones whole or not at all."""
-
 import errno
 import json
 from dataclasses import asdict, replace

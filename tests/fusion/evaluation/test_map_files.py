@@ -1,5 +1,3 @@
-"""Tracks as GeoJSON and GPX, as other programs read them."""
-
 import re
 from dataclasses import replace
 from datetime import UTC, datetime

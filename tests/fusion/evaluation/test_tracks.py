@@ -1,5 +1,3 @@
-"""Tracks without a filter: the IMU alone, chained displacements, steps."""
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -79,7 +79,6 @@ def test_covariance_stays_symmetric_and_positive():
 
 
 def clone_position_covariance(ekf: Driven, slot: int) -> np.ndarray:
-    """Covariance (3, 3) of a clone's position [m^2]."""
     return plain_covariances([ekf.state.clone_estimate(slot)])[0, 6:9, 6:9]
 
 

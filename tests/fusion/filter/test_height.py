@@ -1,5 +1,3 @@
-"""The barometer in both estimators: what it observes, and what it must not."""
-
 from dataclasses import replace
 from typing import Any
 
@@ -118,7 +116,6 @@ def level_oracle(house, make_oracle):
 
 
 def climb_error(track: Track, sequence: ImuSequence) -> float:
-    """Return the largest error of the height [m], relative to the start."""
     z = track.trajectory.position_W[:, 2]
     true = sequence.truth.at(track.time).position_W[:, 2]
     return float(np.abs(z - z[0] - true + true[0]).max())

@@ -1,5 +1,3 @@
-"""The magnetic bearing: what it observes, what it must not observe, and how robust it is."""
-
 import math
 from dataclasses import replace
 
@@ -35,7 +33,6 @@ FIELD_W = np.array([15.0, 12.0, -40.0])
 
 
 def measured(sequence: ImuSequence, rate: float = 25.0, seed: int = 0) -> Magnetometer:
-    """Samples of the field in a place without steel, with white noise of 1 uT."""
     truth = sequence.truth
     time = np.arange(truth.time[0], truth.time[-1], 1.0 / rate)
     field = truth.at(time).attitude_WB.inv().apply(FIELD_W)

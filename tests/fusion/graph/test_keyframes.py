@@ -1,5 +1,3 @@
-"""The batch graph on simulated walks: against the filter, under symmetries, faults and fixes."""
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Averaged heights by the pressure: what is a climb, a step of the air, or nothing."""
-
 import numpy as np
 import pytest
 

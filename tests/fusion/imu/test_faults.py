@@ -1,5 +1,3 @@
-"""Faulty samples: values at a sensor's limit, a clock that is set back."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +13,6 @@ from stario.sequences import ImuSequence, inspect_recording
 
 
 def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
-    """Number of samples flagged in a stream that is checked interval by interval."""
     detector, rows = OutlierDetector(), np.zeros((len(gyro_x), 7))
     rows[:, 0], rows[:, 1] = 0.01 * np.arange(len(gyro_x)), gyro_x
     pieces = (rows[k : k + size].copy() for k in range(0, len(rows) - 1, size - 1))

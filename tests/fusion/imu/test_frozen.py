@@ -1,5 +1,3 @@
-"""Sensors that stop and repeat their last values, both together or one alone."""
-
 from dataclasses import replace
 
 import numpy as np

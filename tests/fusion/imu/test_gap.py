@@ -1,5 +1,3 @@
-"""Gaps of the samples, and the magnetometer's rows between them."""
-
 import math
 from dataclasses import replace
 

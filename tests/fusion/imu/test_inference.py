@@ -1,5 +1,3 @@
-"""Windows of the network: inference, and the direction of its displacements."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -58,8 +56,6 @@ def test_a_model_without_memory_refuses_that_of_another(walk, still_model):
 
 
 class Walking:
-    """Predicts 1.5 m ahead for every window, with a sigma of 1 cm per axis."""
-
     def predict(self, windows):
         n = len(windows)
         return np.tile([1.5, 0.0, 0.0], (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1))

@@ -1,5 +1,3 @@
-"""Pressures and places that phones push: heights, floors, and what the recording keeps of them."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Devices of the server, and what is drawn of their tracks."""
-
 from __future__ import annotations
 
 from types import SimpleNamespace
@@ -18,7 +16,6 @@ from .conftest import command, full_disk, send
 
 @pytest.fixture
 def full(client, hub, pushes):
-    """A hub with as many devices as it may have."""
     for k in range(MAX_DEVICES):
         send(client, pushes(f"phone{k}", seconds=1.0))
     return hub

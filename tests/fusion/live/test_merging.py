@@ -1,5 +1,3 @@
-"""Readings of several sensors, in any order, become samples."""
-
 from __future__ import annotations
 
 import csv

@@ -1,5 +1,3 @@
-"""Places by satellites on the live page: drawn, used, compared or ignored; the map below them."""
-
 from __future__ import annotations
 
 import re

@@ -1,5 +1,3 @@
-"""The server accepts pushes, refuses malformed ones, and draws the same track as `stario run`."""
-
 import json
 from dataclasses import replace
 
@@ -109,7 +107,6 @@ def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes,
 
 
 def scaled(bodies, factor):
-    """Pushes of an accelerometer with another unit or sign."""
     for body in bodies:
         message = json.loads(body)
         for entry in message["payload"]:

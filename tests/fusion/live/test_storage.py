@@ -1,5 +1,3 @@
-"""Recordings on disk, and what is told when it fails."""
-
 from __future__ import annotations
 
 import logging

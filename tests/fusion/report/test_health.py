@@ -1,5 +1,3 @@
-"""Findings of a run's health: which there are, how severe, and the numbers and advice in them."""
-
 from __future__ import annotations
 
 import pytest

@@ -1,5 +1,3 @@
-"""Configuration files are read, validated, saved and read back."""
-
 import json
 from dataclasses import asdict, replace
 

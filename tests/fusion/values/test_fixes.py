@@ -1,5 +1,3 @@
-"""Absolute fixes: on time, late or early, in stream and batch, and the map frame they define."""
-
 import numpy as np
 import pytest
 import support
@@ -30,7 +28,6 @@ def model(walk, make_oracle):
 
 @pytest.fixture(scope="module")
 def fixed(walk, model):
-    """The filter's track of the walk with the fixes of `fixes_of`."""
     return Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes_of(walk))
 
 

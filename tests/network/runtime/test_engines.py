@@ -1,5 +1,3 @@
-"""Both engines give what the network in training gives, on any windows, in any process."""
-
 import pickle
 import subprocess
 import sys

@@ -43,7 +43,6 @@ def path(speed: float = 1.0, yaw: float = 0.0) -> Trajectory:
 
 
 def stream_of(trajectory: Trajectory, name: str = "path") -> WorldStream:
-    """The measurements of a perfect IMU along a trajectory."""
     recording = simulate_imu(trajectory, errors=PERFECT_IMU, name=name)
     (stream,) = world_streams(recording, attitude="true")
     return stream

@@ -1,5 +1,3 @@
-"""What a training begins with: recipe and initial weights."""
-
 import json
 import math
 from dataclasses import replace

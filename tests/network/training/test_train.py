@@ -1,5 +1,3 @@
-"""Training: what a run writes, and the weights it keeps."""
-
 import math
 from dataclasses import replace
 from itertools import count

@@ -1,5 +1,3 @@
-"""The leg loss: its invariance to yaw, its sensitivity to length, and its weights."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Metrics against evo and closed forms, and their invariance to rotations and shifts."""
-
 import warnings
 from dataclasses import replace
 
@@ -14,7 +12,6 @@ ERRORS = ("ate_m", "rte_m", "pde", "aye_rad")
 
 
 def walk(duration: float = 100.0, rate: float = 20.0) -> Trajectory:
-    """Smooth trajectory with changing height, turns and a tilting body."""
     t = np.arange(round(duration * rate) + 1) / rate
     position = np.stack([8 * np.sin(0.11 * t), 5 * np.sin(0.23 * t), 0.4 * np.sin(0.5 * t)], axis=1)
     tilt = Rotation.from_rotvec(np.stack([0.3 * np.sin(t), 0.2 * np.cos(t), 0 * t], axis=1))

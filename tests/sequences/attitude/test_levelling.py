@@ -1,5 +1,3 @@
-"""Attitude from gravity and levelling, against simulated ground truth."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

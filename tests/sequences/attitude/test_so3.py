@@ -1,5 +1,3 @@
-"""Rotations: exponential and logarithm, products of stacks."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp

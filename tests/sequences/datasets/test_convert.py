@@ -1,5 +1,3 @@
-"""Recordings converted to other layouts and archives."""
-
 import logging
 from dataclasses import replace
 

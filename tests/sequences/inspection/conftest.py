@@ -1,5 +1,3 @@
-"""A walk for the checks of units, axes, times and values."""
-
 import pytest
 
 from stario.sequences import WalkStyle, generate_walk, simulate_imu

@@ -1,5 +1,3 @@
-"""A gyroscope with other axes or signs than the accelerometer is refused, a biased one is not."""
-
 from dataclasses import replace
 
 import numpy as np

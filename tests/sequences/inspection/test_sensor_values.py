@@ -1,5 +1,3 @@
-"""Values that never change, are stuck, at their limit or wild: refused, named or tolerated."""
-
 import warnings
 from dataclasses import replace
 

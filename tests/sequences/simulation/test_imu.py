@@ -1,5 +1,3 @@
-"""Simulated sensors: IMU and magnetometer."""
-
 import math
 from dataclasses import replace
 

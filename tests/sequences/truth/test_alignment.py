@@ -1,5 +1,3 @@
-"""Lag, clock offset, mount and axes between a tracked body and its IMU."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The truth fitted to the gyroscope: clock, axes, tilt, scale and bias."""
-
 import re
 from dataclasses import replace
 

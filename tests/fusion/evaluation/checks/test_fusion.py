@@ -1,5 +1,3 @@
-"""Checks of recordings by group: fusion and network, fixes, missing samples."""
-
 from dataclasses import replace
 from itertools import count
 
@@ -61,7 +59,6 @@ def test_ratios_of_two_tracks_are_geometric_means_with_their_standard_error():
 
 
 def test_time_is_per_minute_of_data(monkeypatch):
-    """With a clock that advances by a second on every reading."""
     clock = count()
     monkeypatch.setattr(fusion, "process_time", lambda: float(next(clock)))
     found = simulated_gain(0, 10.0, graph=True)

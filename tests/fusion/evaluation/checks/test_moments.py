@@ -1,5 +1,3 @@
-"""Bad moments and simulated walks: what is measured, and the tables."""
-
 from dataclasses import replace
 
 import numpy as np
