@@ -13,9 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from stario.fusion.commands import options
 from stario.fusion.commands.cli import app
-from stario.fusion.commands.common import origin_of
 from stario.fusion.values.config import read_config
 from stario.network.model import load_model
 from stario.sequences import about_z, read_tum, write_csv
@@ -137,6 +135,7 @@ def test_a_track_with_fixes_is_aligned_by_a_fit(stario, recording, tmp_path, tru
     fixes = true_fixes(yaw=1.0)
     done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
     assert json.loads(done.out)["track"]["ate_m"] < 0.3
+    assert json.loads((tmp_path / "fixed/run.json").read_text())["fixes"] == str(fixes)
     words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
     assert "least squares" in words["alignment"]
     done = stario("compare", recording, "--fixes", fixes, "--out", "compared", "--json")
@@ -184,14 +183,6 @@ def test_a_folder_states_what_produced_its_results(stario, recording, tmp_path, 
     }
 
 
-def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path):
-    reading = options.Reading(gyro_unit="deg/s", where=["person=dan"])
-    estimating, fixes = options.Estimator(), tmp_path / "fixes.csv"
-    origin = origin_of([], reading, estimating, estimating.network(), fixes)
-    assert origin["reading"] == {"gyro_unit": "deg/s", "where": ["person=dan"]}
-    assert origin["fixes"] == str(tmp_path / "fixes.csv")
-
-
 @pytest.mark.usefixtures("no_figures")
 def test_run_accepts_a_folder_or_a_list_and_explains_figures_once(stario, recording, tmp_path):
     (tmp_path / "all").mkdir()
@@ -225,6 +216,9 @@ def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_pat
     flags = ["--gyro-unit", "deg/s", "--accel-unit=-g", "--axes", "y,-x,z", "--gravity", "removed"]
     done = stario(command, "odd.csv", *target, *flags)
     assert done.code == 0, done.err
+    if command == "run":
+        reading = json.loads((tmp_path / "runs/odd/run.json").read_text())["reading"]
+        assert reading["gyro_unit"] == "deg/s"
 
 
 def test_inspect_names_the_option_that_helps(stario, recording, tmp_path, request):

@@ -124,7 +124,7 @@ def test_an_option_that_would_do_nothing_is_refused(stario, recording, tmp_path,
 @pytest.mark.parametrize(
     ("command", "content", "named"),
     [
-        ("compare", '{"filter": {"speed": 1}}', "filter.speed"),
+        ("compare", '{"filter": {"speed": 1}}', "settings.json: filter.speed"),
         ("run", "{", "settings.json"),
         ("train", '{"speed": 1}', "settings.json: speed"),
         ("train", '{"epochs": 0}', "settings.json: epochs"),

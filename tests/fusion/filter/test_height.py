@@ -269,9 +269,11 @@ def test_pressures_in_other_units_are_refused(pressure, unit, still_model):
 def test_late_and_broken_pressures_are_counted(make_walk, still_model):
     stream = Navigator(still_model)
     states_of(stream, make_walk(seconds=5.0).select(slice(400)))
-    for time, pressure in ((float("nan"), 1000.0), (3.95, float("nan")), (1.0, 1000.0)):
+    stream.push_pressure(3.9, 1000.0)
+    wrong = (np.nan, 1000.0), (3.95, np.nan), (1.0, 1000.0), (3.9, 1000.0)
+    for time, pressure in wrong:
         stream.push_pressure(time, pressure)
-    assert stream.health.pressures_dropped == 3
+    assert stream.health.pressures_dropped == len(wrong)
     with pytest.raises(InputError, match="a number of hPa"):
         stream.push_pressure(4.0, "1000")
 

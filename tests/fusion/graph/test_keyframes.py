@@ -234,19 +234,3 @@ def test_accurate_positions_with_an_unknown_height_need_no_fall_back(walk, make_
     for state, p_W in ((states[-1], states[-1].p_W), (track, track.trajectory.position_W[-1])):
         true = walk.truth.at(np.array([min(np.atleast_1d(state.time)[-1], 14.0)])).position_W[0]
         assert np.linalg.norm((p_W - true)[:2]) < 0.5
-
-
-def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(make_walk, make_oracle):
-    walk = make_walk(1, 40.0)
-    R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
-    truth = walk.truth.at(np.array([5.0, 30.0]))
-    p_W = R.apply(truth.position_W) + shift
-    fixes = [position_fix(t, p, 0.01 * np.eye(3)) for t, p in zip((5.0, 30.0), p_W, strict=True)]
-    track = graph(make_oracle(walk, walk.truth, CONFIG), CONFIG).run(walk, fixes=fixes)
-    times = np.clip(track.time, 0.0, walk.time[-1])
-    error = track.trajectory.position_W - R.apply(walk.truth.at(times).position_W) - shift
-    assert np.linalg.norm(error, axis=1).max() < 1.0
-    P = track.covariance[:, 6:9, 6:9]
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
-    assert 0.05 < np.median(nees) < 2.4  # median of chi-square with 3 DoF: 2.4
-    assert track.health.fixes["applied"] == 2

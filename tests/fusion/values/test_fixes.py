@@ -226,12 +226,6 @@ def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(walk, mo
         assert np.linalg.norm(error) < 0.5 + 0.8 * off
 
 
-def test_positions_too_close_together_do_not_turn_the_map_frame(walk, model):
-    fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
-    track = Navigator(model, CONFIG, backend="ekf").run(walk.slice(0.0, 8.0), fixes=fixes)
-    assert track.health.fixes == {"applied": 1, "yaw not known": 2}
-
-
 def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model):
     """However the walk lies in the map, the error is within the sigma; the pivot is sure."""
     fix, walk = position_fix(5.0, truth_at(walk, 5.0)[0], 0.01 * EYE), walk.slice(0.0, 12.0)

@@ -201,27 +201,6 @@ def test_weights_are_per_second_of_stream_and_no_window_extends_past_its_end():
     assert float(displacement[:, 2].max()) < 1.81
 
 
-def mapped(stream: WorldStream, folder: Path) -> WorldStream:
-    """The same stream in memory-mapped files."""
-    for name in ("imu_W", "position_W", "facing_W"):
-        np.save(folder / f"{stream.name}-{name}.npy", getattr(stream, name))
-    imu_W, position_W, facing_W = (
-        np.load(folder / f"{stream.name}-{name}.npy", mmap_mode="r")
-        for name in ("imu_W", "position_W", "facing_W")
-    )
-    return WorldStream(stream.name, imu_W, position_W, facing_W)
-
-
-def test_memory_mapped_streams_give_the_same_windows(tmp_path):
-    streams = [stream_of(path(speed), f"path-{speed}") for speed in (1.0, 1.4, 0.8)]
-    files = [mapped(stream, tmp_path) for stream in streams]
-    weights = [1.0, 0.3, 2.0]
-    memory, disk = (WindowSampler(s, weights, Augmentation(), seed=5) for s in (streams, files))
-    for _ in range(3):
-        for expected, found in zip(memory.batch(64), disk.batch(64), strict=True):
-            assert torch.equal(expected, found)
-
-
 def test_ten_hours_on_disk_are_not_loaded_into_memory(tmp_path):
     statm = Path("/proc/self/statm")
     if not statm.exists():
