@@ -25,6 +25,7 @@ def test_wrong_units_and_missing_gravity_are_refused(walk, still_model, wrong, r
         with pytest.raises(InputError, match=remedy) as caught:
             Navigator(still_model).run(sequence)
         assert "\n" not in str(caught.value)
+        assert "--" not in str(caught.value)  # no option of the command
 
 
 @pytest.mark.parametrize("scale", [1 / 9.80665, 0.0])

@@ -52,6 +52,7 @@ def test_compare_writes_a_report_of_what_is_known(stario, recording, no_figures,
         text = (tmp_path / "told" / name / "report.html").read_text()
         assert {label for label in TRACK_LABELS if f"</svg>{label}</button>" in text} == labels
         assert "filter, as in a stream" not in text
+        assert ("Accuracy against ground truth" in text) == ("truth" in labels)
 
 
 def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures, monkeypatch):

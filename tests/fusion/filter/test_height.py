@@ -1,9 +1,9 @@
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from initial_ekf import Driven
+from simulated import Still
 from support import nav_state, samples
 from support import stream as states_of
 
@@ -246,16 +246,8 @@ def test_weather_and_doors_on_a_level_floor_are_worth_their_sigma(make_walk):
     doors = np.array([20.0, 40.0])
     air = simulate_barometer(walk.truth, doors, 1, weather=0.03, door=0.5)
     with_air = replace(walk, barometer=air)
-    track = Navigator(Level(), CONFIG).run(with_air)
+    track = Navigator(Still(variance=(4.0, 4.0, 1e-3)), CONFIG).run(with_air)
     assert climb_error(track, with_air) < 1.0
-
-
-class Level:
-    """Predicts that every window is level, and nothing about where it leads."""
-
-    def predict(self, windows: Any) -> tuple[np.ndarray, np.ndarray]:
-        n = len(windows)
-        return np.zeros((n, 3)), np.tile(np.diag([4.0, 4.0, 1e-3]), (n, 1, 1))
 
 
 @pytest.mark.parametrize(

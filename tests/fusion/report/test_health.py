@@ -61,6 +61,8 @@ NOTHING = "nothing"
         (GAPS | {"gaps": [(5.0, 0.25), (7.0, 0.25)]}, [], "gaps", ""),
         (GAPS | {"gaps": [(5.0, 0.15), (5.6, 0.15), (6.2, 0.15)]}, [], "gaps", ""),
         (GAPS | {"longest_gap": 4.0}, ["gaps"], "", "4.00 s"),
+        (GOOD | {"corrections": [(93.2, 4.0, 0.5, "magnetic field")]}, ["corrections"], "",
+         "4.0 m and 29 degrees at 93.2 s: magnetic field"),
     ],
 )  # fmt: skip
 def test_what_stands_out_is_found_and_every_warning_has_advice(health, warned, noted, words):

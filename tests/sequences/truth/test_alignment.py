@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from walked import walked
 
-from stario.sequences import InputError, WalkStyle, generate_walk
+from stario.sequences import InputError
 from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.alignment import align_tracked_body, clock_offset
 from stario.sequences.attitude.mounts import heading_turn
@@ -12,15 +13,14 @@ from stario.sequences.attitude.rotations import cumulative_rotations
 from stario.sequences.conventions import axes_matrix
 from stario.sequences.readers.poses import accel_axes
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
-from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
+from stario.sequences.simulation.imu import PERFECT_IMU
 
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 LEVER_B = np.array([0.02, -0.1, 0.01])
 
 
 def recorded(carry: str, seconds: float = 120.0) -> tuple[ImuSequence, Trajectory]:
-    style = WalkStyle(carry=carry, preferred_speed=0.8, mount_rotvec=(0.0, 0.0, 0.0))
-    imu = simulate_imu(generate_walk(3, seconds, style=style), 100.0, PHONE_IMU)
+    imu = walked(3, seconds, carry=carry, preferred_speed=0.8, mount_rotvec=(0.0, 0.0, 0.0))
     return imu, imu.truth
 
 
@@ -174,8 +174,7 @@ def test_what_cannot_be_aligned_is_refused():
 
 @pytest.fixture(scope="module")
 def walk():
-    style = WalkStyle(mount_rotvec=(0.3, -0.2, 0.9))
-    return simulate_imu(generate_walk(2, 20.0, style=style), 100.0, PERFECT_IMU)
+    return walked(2, 20.0, PERFECT_IMU, mount_rotvec=(0.3, -0.2, 0.9))
 
 
 @pytest.mark.parametrize("axes", ["z,x,y", "x,-z,y", "-z,-y,-x"])
