@@ -85,7 +85,6 @@ def test_live_refuses_a_port_in_use(stario):
 
 
 def test_training_without_a_terminal_tells_its_progress_and_the_time_left(monkeypatch, capsys):
-    """Steps of four seconds: a line every third of them, none of seconds that had no step."""
     clock = count(0.0, 4.0)
     monkeypatch.setattr("stario.fusion.commands.common.monotonic", lambda: next(clock))
     with training_progress(100) as progress:

@@ -141,7 +141,6 @@ def test_seeds_are_averaged_over_common_recordings_only():
 
 
 def test_sets_have_equal_weights_however_many_recordings_they_have():
-    """Eight times the error on the two recordings of one set, none on the six of the other."""
     other = part(errors(8.0), slice(0, 3, 2)) | part(errors(1.0), slice(1, None, 2))
     found = ranked({"StarIO": [errors(1.0)], "other": [other]})["other"]["ratio"]
     assert found.ratio == pytest.approx(np.sqrt(8.0))

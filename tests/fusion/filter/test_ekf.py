@@ -80,7 +80,6 @@ def clone_position_covariance(ekf: Driven, slot: int) -> np.ndarray:
 
 
 def test_a_precise_fix_of_an_unknown_position_keeps_the_covariance_valid(driven):
-    """The covariance stays accurate after a fix that is far more precise than the prior."""
     fresh = initialised(6)
     held = [fresh.clone()]
     fresh.propagate(segments(1)[0])
@@ -140,7 +139,6 @@ def test_once_the_yaw_is_lost_levelling_a_far_track_leaves_it_where_it_is():
 
 
 def test_displacements_carry_no_information_about_yaw_and_position(driven):
-    """Information N^T P^-1 N about turning or shifting all poses together does not change."""
     newest = max(range(6), key=lambda slot: driven.state.clone_estimate(slot).time)
     driven.release(newest)  # it equals the current pose, P has no inverse with it
     held = np.flatnonzero(np.diag(driven.P))

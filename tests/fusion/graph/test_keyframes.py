@@ -54,7 +54,6 @@ def test_states_are_at_the_filters_times_with_a_smaller_covariance(walk, oracle,
 
 
 def test_the_track_follows_the_imu_between_keyframes(walk, make_oracle):
-    """Velocity is the derivative of position, and nothing jumps at keyframes."""
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
     track = graph(oracle).run(walk).trajectory
     step = np.diff(track.time)[:, None]
@@ -156,7 +155,6 @@ def test_a_gap_is_crossed_and_its_sigma_covers_the_error(walk, make_oracle, with
 
 @pytest.mark.parametrize("time", [10.0, 10.37, 10.4])
 def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(walk, make_oracle, time):
-    """On a keyframe, between the filter's states, and on one of them."""
     walk = walk.slice(0.0, 15.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     truth = walk.truth.at(np.array([time])).position_W[0]

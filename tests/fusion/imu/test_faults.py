@@ -14,7 +14,7 @@ from stario.fusion.imu.faults import (
 )
 from stario.fusion.recording import cut_recording
 from stario.network import load_model
-from stario.sequences import ImuSequence, InputError, inspect_recording
+from stario.sequences import ImuSequence, inspect_recording
 
 
 def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
@@ -136,14 +136,6 @@ def test_a_block_that_is_logged_twice_does_not_change_the_track(make_walk, still
     np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
 
 
-def test_shuffled_rows_are_reported_with_the_advice_to_sort_them(make_walk):
-    walk = make_walk(3, 16.0)
-    order = np.random.default_rng(0).permutation(len(walk))
-    problems = " ".join(told(in_order(walk.without_truth(), order)))
-    assert "sort the rows" in problems
-    assert "ms" not in problems
-
-
 def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk):
     walk = make_walk(3, 16.0)
     gyro = walk.gyro.copy()
@@ -198,14 +190,6 @@ def test_a_sensor_at_rest_may_repeat_its_values(still_model):
     """Simulated without noise, or so coarse that its noise does not show."""
     health = Navigator(still_model, backend="ekf").run(lying(10.0)).health
     assert health.samples["frozen"] == 0
-
-
-@pytest.mark.parametrize("accel", [0.0, 1.0])
-def test_an_unchanging_stream_is_refused_for_its_force(still_model, accel):
-    silent = lying(3.0)
-    silent.accel[:, 2] = accel
-    with pytest.raises(InputError, match="accel"):
-        stream(Navigator(still_model), silent)
 
 
 def held(walk: ImuSequence, sensor: str, start: float, stop: float) -> ImuSequence:

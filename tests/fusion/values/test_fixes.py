@@ -154,7 +154,6 @@ def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk):
 
 @pytest.mark.parametrize("turn", [0.0, -2.5])
 def test_two_positions_determine_the_position_and_direction_of_a_track(walk, model, turn):
-    """The map frame is turned and shifted relative to the walk's by any amount."""
     R, shift = about_z(turn).as_matrix(), np.array([5e3, -2e4, 30.0])
     places = ((t, R @ truth_at(walk, t)[0] + shift) for t in (4.0, 6.0, 28.0, 29.6))
     fixes = [position_fix(t, place, 1e-4 * EYE) for t, place in places]
@@ -265,19 +264,6 @@ def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model):
 )
 def test_an_invalid_fix_has_a_fault(fix, reason):
     assert fix.fault() == reason
-
-
-def test_invalid_fixes_are_refused_and_counted(walk, model):
-    short = walk.slice(0.0, 6.0)
-    bad = [position_fix(5.0, [np.nan, 0, 0], EYE), yaw_fix(5.0, 90.0, 0.1)]
-    expected = {"value that is not finite": 1, "yaw not in radians": 1}
-    track = Navigator(model, CONFIG, backend="ekf").run(short, fixes=bad)
-    assert track.health.fixes == expected
-    navigator = Navigator(model, CONFIG)
-    streamed(navigator, short, bad, 0.2)
-    assert navigator.health.fixes == expected
-    assert np.isfinite(navigator.state.covariance).all()
-    assert navigator.state.map_frame == 0
 
 
 def test_the_covariance_of_an_exact_fix_has_a_floor(walk, model):

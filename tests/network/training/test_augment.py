@@ -257,7 +257,6 @@ def test_a_swing_continues_from_one_window_to_the_next():
 
 
 def test_windows_do_not_depend_on_where_the_device_points():
-    """In the device's heading frame, a path and its rotated copy give the same batch."""
     plain = replace(YAW_ONLY, any_yaw=0.0, yaw=0.0)
     rotated = stream_of(path(yaw=2.0))
     first, second = (WindowSampler([s], [1.0], plain, seed=4).batch(16) for s in (STREAM, rotated))

@@ -182,7 +182,6 @@ def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(walk
 
 
 def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees(still_model, walk, monkeypatch):
-    """Three ends: the unmodified one, one 0.5 m and 20 degrees off, the others not at all."""
     time, position = np.arange(3.0), np.outer(np.arange(3.0), [5.0, 0.0, 0.0])
     turned = about_z(np.radians([0.0, 10.0, -20.0]))
     straight = Track(Trajectory(time, position, about_z(np.zeros(3))))
