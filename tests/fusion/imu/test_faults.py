@@ -14,7 +14,7 @@ from stario.fusion.imu.faults import (
 )
 from stario.fusion.recording import cut_recording
 from stario.network import load_model
-from stario.sequences import ImuSequence, inspect_recording
+from stario.sequences import ImuSequence, InputError, inspect_recording
 
 
 def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
@@ -82,10 +82,6 @@ def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
     return replace(walk.without_truth(), time=np.where(late, walk.time - by, walk.time))
 
 
-def in_order(walk: ImuSequence, rows: np.ndarray) -> ImuSequence:
-    return replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
-
-
 def test_a_stream_raises_an_error_and_restarts(make_walk, still_model):
     walk = set_back(make_walk(3, 16.0), 100.0)
     first = PriorPose(np.eye(3), np.zeros(3), np.array([50.0, 0.0, 0.0]))
@@ -131,7 +127,7 @@ def test_late_samples_and_bursts_are_not_another_clock():
 
 def test_a_block_that_is_logged_twice_does_not_change_the_track(make_walk, still_model):
     walk = make_walk(3, 16.0).without_truth()
-    twice = in_order(walk, np.r_[0:800, 600 : len(walk)])
+    twice = walk.select(np.r_[0:800, 600 : len(walk)])
     track, plain = (Navigator(still_model, backend="ekf").run(each) for each in (twice, walk))
     np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
 
@@ -190,6 +186,14 @@ def test_a_sensor_at_rest_may_repeat_its_values(still_model):
     """Simulated without noise, or so coarse that its noise does not show."""
     health = Navigator(still_model, backend="ekf").run(lying(10.0)).health
     assert health.samples["frozen"] == 0
+
+
+@pytest.mark.parametrize("accel", [0.0, 1.0])
+def test_an_unchanging_stream_is_refused_for_its_force(still_model, accel):
+    silent = lying(3.0)
+    silent.accel[:, 2] = accel
+    with pytest.raises(InputError, match="accel"):
+        stream(Navigator(still_model), silent)
 
 
 def held(walk: ImuSequence, sensor: str, start: float, stop: float) -> ImuSequence:
