@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from stario.network.architectures import ARCHITECTURES, architecture, build_network
-from stario.network.baselines.networks import Rnin
+from stario.network.baselines.networks import NoiseLayer, Rnin
 from stario.network.runtime.survey import peak_bytes, survey, survey_table, table_counts
 from stario.sequences.errors import InputError
 
@@ -134,3 +134,11 @@ def test_rnin_gives_the_same_for_a_series_at_once_and_step_by_step():
         for k in range(5):
             outputs, state = rnin.step(series[:, k], state)
             torch.testing.assert_close(outputs, at_once[:, k], rtol=1e-4, atol=1e-6)
+
+
+def test_the_noise_layer_subtracts_a_weighted_copy_of_the_raw_window():
+    layer = NoiseLayer(4)
+    features, raw = torch.randn(3, 4), torch.randn(3, 4)
+    with torch.no_grad():
+        layer.bias.fill_(0.5)
+        torch.testing.assert_close(layer(features, raw), features - layer.weight * raw + 0.5)
