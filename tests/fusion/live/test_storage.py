@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import logging
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace

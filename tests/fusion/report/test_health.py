@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 from recorded import DATA
 from told import health_verdict as findings
