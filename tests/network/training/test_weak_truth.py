@@ -87,18 +87,6 @@ def test_true_displacements_leave_no_residual_on_a_rotated_map(kind, every):
         assert longest > 2.0
 
 
-def test_residuals_reveal_displacements_a_third_too_short_but_no_common_rotation():
-    recording = with_positions("positions", 0.1)
-    batch = batch_of(recording)
-    predicted_N = true_displacements(recording, batch)
-    whole = leg_residuals(predicted_N, batch)[..., :2].norm(dim=-1).mean()
-    short = leg_residuals(0.67 * predicted_N, batch)[..., :2].norm(dim=-1).mean()
-    turned = rotated(predicted_N, torch.tensor(1.0))
-    common = leg_residuals(turned, batch)[..., :2].norm(dim=-1).mean()
-    assert float(short) > 5.0 * float(whole)
-    assert float(common) == pytest.approx(float(whole), rel=1e-3)
-
-
 def test_the_velocity_change_is_determined_from_the_accelerometer():
     [world] = world_streams(WALK, attitude="true")
     accel_W = torch.from_numpy(world.imu_W[: SECONDS * 200, 3:5]).view(1, SECONDS, 200, 2)
