@@ -150,6 +150,7 @@ WRONG = [
     ("accelerometer", lambda w: replace(w, accel=0.5 * w.accel)),
     ("accelerometer", lambda w: replace(w, accel=0.0 * w.accel)),
     ("omit the unit g", lambda w: with_units(w.without_truth(), accel_unit="g")),
+    ("swapped: exchange them", lambda w: replace(w, gyro=w.accel, accel=w.gyro)),
     ("x y z w", shuffled),
     ("found 10 samples/s, .* 50 to 1000; set the app", lambda w: w.select(np.arange(0, 6000, 20))),
     (r"batches: 200 samples/s, most 0\.0001 s apart, .*space their samples evenly", batches),

@@ -72,6 +72,10 @@ def test_what_is_not_in_an_archive_is_refused_with_what_is(tmp_path):
             del group["imu"]
     with pytest.raises(ReadError, match="imu/t: found none in the whole archive"):
         find_recordings(path)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["data"] = np.zeros((5, 7))
+    with pytest.raises(ReadError, match="recordings: found no group, expected one for each"):
+        read_recording(tmp_path / "other.h5", format="archive")
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(ReadError, match=r"walks\.h5: content: .*truncated.*complete"):
         read_recording(path)
