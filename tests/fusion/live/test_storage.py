@@ -109,20 +109,6 @@ def test_a_gyroscope_in_another_unit_is_shown_though_the_track_begins_again(sess
     assert all(shown[first:])
 
 
-def test_a_full_disk_is_shown_until_it_has_space(session, batches, monkeypatch):
-    for batch in batches[:10]:
-        session.take(batch, 1.7e9)
-    append = LiveFile.append
-    monkeypatch.setattr(LiveFile, "append", full_disk)
-    with pytest.raises(OSError, match="space"):
-        session.take(batches[10], 1.7e9)
-    assert "No space left" in session.status()["problem"]
-    monkeypatch.setattr(LiveFile, "append", append)
-    assert session.take(batches[10], 1.7e9) == 20
-    assert session.status()["problem"] == ""
-    assert len(read_recording(session.track.path)) == session.track.samples == 220
-
-
 def test_what_a_full_disk_loses_is_counted(session, batches, monkeypatch):
     monkeypatch.setattr(track_module, "_MAX_UNWRITTEN", 100)
     append = LiveFile.append
