@@ -69,5 +69,4 @@ def turned_and_measured(
 
 
 def max_angle(a: Rotation, b: Rotation) -> float:
-    """Return the largest angle [rad] between two stacks of rotations."""
     return float((a.inv() * b).magnitude().max())

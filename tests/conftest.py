@@ -1,5 +1,3 @@
-"""Environment of all tests."""
-
 import os
 from functools import lru_cache
 

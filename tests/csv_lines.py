@@ -1,5 +1,3 @@
-"""Lines of a generic CSV."""
-
 from pathlib import Path
 
 ROW = "0.1,0.2,0.3,1.0,2.0,9.0"

@@ -113,7 +113,6 @@ def alike(form: str, header: str, *times: object, **sensors: FloatArray) -> list
 
 
 def zyx(w: Walk, **sensors: FloatArray) -> list[File]:
-    """Sensor Logger's files, columns z, y, x."""
     backward = {name: values[:, ::-1] for name, values in sensors.items()}
     return alike("{}.csv", ZYX, w.ns, w.t, **backward)
 

@@ -58,7 +58,6 @@ def cut(walk: ImuSequence, rows: slice) -> ImuSequence:
 
 
 def field_of(walk: ImuSequence) -> FloatArray:
-    """The magnetic field in B at each sample."""
     return np.asarray(walk.truth.attitude_WB.apply(FIELD_W, inverse=True))
 
 

@@ -1,5 +1,3 @@
-"""Every example runs and returns the documented result."""
-
 import importlib.util
 import re
 import subprocess

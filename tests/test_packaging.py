@@ -1,5 +1,3 @@
-"""The installed package matches the source tree."""
-
 import ast
 import importlib
 import inspect

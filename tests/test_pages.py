@@ -40,19 +40,16 @@ def lines(text: str) -> list[str]:
     return [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
 
 
-def options_of(command: typer.main.TyperCommand) -> set[str]:
-    return {name for option in command.params for name in (*option.opts, *option.secondary_opts)}
-
-
 def check_known(words: list[str]) -> None:
     """Check that subcommands and options of a `stario` command exist; its files need not."""
     command, rest = typer.main.get_command(app), words[1:]
     while rest and hasattr(command, "commands") and not rest[0].startswith("-"):
         assert rest[0] in command.commands, " ".join(words)
         command, rest = command.commands[rest[0]], rest[1:]
+    known = {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
     for word in rest:
         if word.startswith("--"):
-            assert word.partition("=")[0] in options_of(command), f"{word} in {' '.join(words)}"
+            assert word.partition("=")[0] in known, f"{word} in {' '.join(words)}"
 
 
 def stario_commands(text: str) -> list[list[str]]:

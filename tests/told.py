@@ -17,18 +17,15 @@ UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
 def told(sequence: ImuSequence) -> list[str]:
-    """Return what an inspection finds."""
     return [str(found) for found in inspect_recording(sequence).findings]
 
 
 def health_verdict(health: Health | None) -> list[Finding]:
-    """Return the verdict on a run's health alone."""
     assert health is not None
     return verdict(health_findings(health))
 
 
 def health_lines(health: Health | None) -> list[str]:
-    """Return that verdict as the lines of a terminal."""
     return [finding.line() for finding in health_verdict(health)]
 
 

@@ -24,11 +24,9 @@ class Shown:
     problems: list[str] = field(default_factory=list)
 
     def overflows(self) -> bool:
-        """Whether the page is wider than its window."""
         return self.page.evaluate("document.documentElement.scrollWidth > window.innerWidth")
 
     def fits(self, size: tuple[int, int]) -> None:
-        """Wait until the page fits a window of another size."""
         self.page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
         fits = "() => document.documentElement.scrollWidth <= window.innerWidth"
         self.page.wait_for_function(fits)

@@ -1,5 +1,3 @@
-"""The live page draws what phones send, controls the server, and agrees with its files."""
-
 import importlib.util
 import threading
 from contextlib import contextmanager
@@ -41,7 +39,6 @@ def server(tmp_path_factory):
 
 @contextmanager
 def running(server):
-    """Run a server in a thread."""
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()

@@ -1,5 +1,3 @@
-"""The report loads without a network, names units, and its slider moves every cursor."""
-
 import re
 from dataclasses import replace
 from functools import cache
@@ -160,18 +158,9 @@ def test_report_of_ten_minutes_is_below_two_megabytes(tmp_path, comparison):
     assert write_report(tmp_path / "r.html", found).stat().st_size < 2_000_000
 
 
-def test_report_of_a_run_without_truth_has_no_table(tmp_path, comparison):
-    bare = Comparison(
-        comparison.sequence.without_truth(), {"track": comparison.track}, {"track": {}}
-    )
-    path = write_report(tmp_path / "r.html", bare)
-    assert "Accuracy against ground truth" not in path.read_text()
-
-
 def test_a_map_server_is_asked_on_request_and_points_have_their_place(
     show, tile_server, comparison, tmp_path
 ):
-    """The track's own x axis points north; the map is drawn with north up."""
     place = Georeference(48.1, 11.5, np.radians(90.0))
     track = replace(comparison.track, georeference=place)
     sequence = replace(comparison.sequence, truth=None)

@@ -1,5 +1,3 @@
-"""Fixtures of the navigator's tests: simulated walks and predictors."""
-
 from copy import deepcopy
 
 import pytest
@@ -50,7 +48,6 @@ def _without():
 
 @pytest.fixture
 def narrow_network(monkeypatch):
-    """Train a small StarIO in place of the whole one."""
     from training_runs import narrow  # which imports torch, for seconds
 
     narrow(monkeypatch)

@@ -59,7 +59,6 @@ class Driven:
 
 
 def initialised(slots: int) -> Driven:
-    """A filter with a tilted, turned and moving initial state."""
     sigma = np.repeat([0.05, 0.3, 0.1, 0.003, 0.05], 3)
     R_WB = exp_so3(np.array([0.5, -0.7, 2.0]))
     v_W, p_W = np.array([[1.0, -0.5, 0.1], [30.0, -20.0, 1.0]])

@@ -1,5 +1,3 @@
-"""Exponential of SE_2(3)."""
-
 from stario.sequences.attitude.so3 import exp_and_left_jacobian
 
 

@@ -1,5 +1,3 @@
-"""Simulated walks, and predictors of their true displacements or of none."""
-
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -87,11 +85,13 @@ class Oracle:
 
 
 class Still:
-    """Predicts zero displacement for every window, with a sigma of 1 m per axis."""
+    """Predicts one displacement for every window, by default none with a sigma of 1 m per axis."""
+
+    def __init__(self, mean=(0.0, 0.0, 0.0), variance=(1.0, 1.0, 1.0)):
+        self.mean, self.covariance = np.array(mean), np.diag(variance)
 
     def predict(self, windows):
-        n = len(windows)
-        return np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
+        return np.tile(self.mean, (len(windows), 1)), np.tile(self.covariance, (len(windows), 1, 1))
 
 
 NOISY = ImuErrors(gyro_turn_on=3e-3, accel_turn_on=0.03)

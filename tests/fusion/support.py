@@ -1,5 +1,3 @@
-"""Settings, error metrics and a faulty network, shared by tests of the navigator."""
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -33,7 +31,6 @@ WHITE = NavigatorConfig(WHITE_NOISE, replace(FILTER, update_rate=1))
 
 
 def samples(sequence: ImuSequence) -> Iterator[tuple[float, Any, Any]]:
-    """Return the IMU's samples as they are pushed."""
     return zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
 
 
@@ -70,7 +67,6 @@ def lying(
 
 
 def true_start(walk: ImuSequence) -> PriorPose:
-    """The walk's first pose and velocity, as a prior."""
     truth = walk.truth
     return PriorPose(truth.attitude_WB[0].as_matrix(), truth.velocity_W[0], truth.position_W[0])
 

@@ -1,5 +1,3 @@
-"""The navigator's handling of bad input, on simulated walks."""
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -290,8 +288,6 @@ def test_a_dead_axis_is_logged_once_per_run(walk, still_model, caplog):
 
 
 class Failing:
-    """Raises an error instead of some predictions."""
-
     def __init__(self, inner: Any, at: set[int]) -> None:
         self.inner, self.at, self.calls = inner, at, 0
 

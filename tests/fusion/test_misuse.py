@@ -1,13 +1,9 @@
-"""Wrong arguments are refused at once, by name."""
-
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
-from simulated import measured
-from support import GRAPH, samples, stream
+from support import samples, stream
 
 from stario.fusion import (
     FilterConfig,
@@ -23,7 +19,7 @@ from stario.fusion import (
     yaw_fix,
 )
 from stario.network import load_model
-from stario.sequences import ImuNoise, InputError, StarioError, read_recording
+from stario.sequences import InputError, StarioError, read_recording
 
 EYE = np.eye(3)
 LEVEL = EYE, np.zeros(3), np.zeros(3)
@@ -105,13 +101,6 @@ def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model):
         navigator.update_position(1e6 + k, np.zeros(3), np.eye(3))
     assert navigator.update_position(5.0, np.zeros(3), np.eye(3)) == "waiting"
     assert navigator.health.fixes == {"too many waiting": 2, "waiting": 10_000}
-
-
-def test_the_graph_accepts_biases_without_random_walk():
-    walk, _, oracle = measured(3, 15.0, GRAPH)
-    steady = replace(GRAPH, noise=ImuNoise(2e-3, 0.1, 0.0, 0.0))
-    track = Navigator(oracle, steady, backend="graph").run(walk)
-    assert not any("fell back" in note for note in track.health.notes)
 
 
 def test_a_snapshot_with_any_byte_changed_is_refused_or_restored(walk, still_model):

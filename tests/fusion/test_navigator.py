@@ -1,5 +1,3 @@
-"""The navigator on simulated walks, with a predictor that returns the ground truth."""
-
 from dataclasses import replace
 
 import numpy as np

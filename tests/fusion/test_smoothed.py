@@ -1,5 +1,3 @@
-"""A recording is smoothed as a whole, a stream by a window; both gain on the filter's states."""
-
 from dataclasses import replace
 from functools import partial
 from typing import Any

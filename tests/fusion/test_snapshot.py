@@ -1,5 +1,3 @@
-"""A stream that is stopped and continued elsewhere gives the same states as without a stop."""
-
 import gc
 import tracemalloc
 import zlib

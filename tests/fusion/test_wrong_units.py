@@ -1,5 +1,3 @@
-"""Recordings and streams in wrong units are refused by name, with what fixes them."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +25,7 @@ def test_wrong_units_and_missing_gravity_are_refused(walk, still_model, wrong, r
         with pytest.raises(InputError, match=remedy) as caught:
             Navigator(still_model).run(sequence)
         assert "\n" not in str(caught.value)
+        assert "--" not in str(caught.value)  # no option of the command
 
 
 @pytest.mark.parametrize("scale", [1 / 9.80665, 0.0])
@@ -100,7 +99,6 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(make_walk, st
 
 
 def starts_and_stops(gyro: np.ndarray) -> ImuSequence:
-    """Shaken for six seconds and calm for six, in turn."""
     time = 0.01 * np.arange(4800)
     shaken = np.where(time % 12.0 < 6.0, np.sin(6.0 * time), 0.0)
     accel = np.array([0.0, 0.0, STANDARD_GRAVITY]) + np.outer(shaken, [0.5, 1.0, 2.0])

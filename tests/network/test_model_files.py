@@ -1,5 +1,3 @@
-"""Files of weights, and the network that they hold."""
-
 import hashlib
 import json
 from pathlib import Path
@@ -20,7 +18,6 @@ DEFAULT = Path(stario.network.__file__).with_name("weights") / "default.safetens
 
 @pytest.fixture
 def model(tmp_path):
-    """A copy of the default weights and their card, to be corrupted."""
     path = tmp_path / "model.safetensors"
     path.write_bytes(DEFAULT.read_bytes())
     card_path(path).write_bytes(card_path(DEFAULT).read_bytes())

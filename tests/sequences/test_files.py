@@ -1,5 +1,3 @@
-"""Files are written completely or not at all, and are read back as written."""
-
 import errno
 import json
 import os

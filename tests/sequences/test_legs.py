@@ -1,5 +1,3 @@
-"""Legs between known positions: how certain their ends are."""
-
 from dataclasses import replace
 
 import numpy as np

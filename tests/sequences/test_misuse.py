@@ -1,5 +1,3 @@
-"""Wrong arguments are refused at once, by name, with what was expected."""
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Fixtures to call the `stario` command, and a recording for it."""
-
 import sys
 from dataclasses import dataclass
 from functools import cache
@@ -14,8 +12,6 @@ from stario.network.model import load_model
 
 @dataclass(frozen=True)
 class CommandResult:
-    """Exit code and output of one call of the command."""
-
     code: int
     out: str
     err: str

@@ -1,5 +1,3 @@
-"""The commands that write recordings and networks: convert, simulate and export."""
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -112,18 +110,6 @@ def test_waypoints_are_reported_and_do_not_count_as_poses(stario, tmp_path):
     assert done.code == 0
     assert stario("convert", "taps.h5", "again.h5").code == 0
     assert find_recordings(tmp_path / "again.h5") == [Path(f"{tmp_path / 'again.h5'}:taps")]
-
-
-def test_simulate_writes_a_recording_with_truth(stario, tmp_path):
-    done = stario("simulate", "w.csv", "--seconds", 5, "--rate", 50, "--seed", 7, "--json")
-    assert done.code == 0
-    figures = json.loads(done.out)
-    sequence = read_generic_csv(tmp_path / "w.csv")
-    assert figures["samples"] == len(sequence) == 251
-    assert figures["duration_s"] == pytest.approx(5.0)
-    assert sequence.truth is not None
-    stario("simulate", "again.csv", "--seconds", 5, "--rate", 50, "--seed", 7)
-    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "w.csv").read_bytes()
 
 
 def test_a_simulated_house_has_floors_pressure_and_satellites(stario, tmp_path):

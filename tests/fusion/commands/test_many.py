@@ -1,5 +1,3 @@
-"""The commands for many recordings: compare, evaluate and the checks."""
-
 import json
 import re
 from dataclasses import fields, replace
@@ -92,14 +90,6 @@ def test_many_recordings_skipped_for_one_reason_take_one_line(stario, recording,
     (line,) = done.err.splitlines()
     assert "5 recordings, the first " in line
     assert "blind-0.csv: truth: found none" in line
-
-
-def test_evaluate_prints_medians_and_needs_truth(stario, recording, tmp_path):
-    done = stario("evaluate", recording)
-    assert done.code == 0
-    assert [line.split()[0] for line in done.out.splitlines()[1:4]] == ["walk", "median", "mean"]
-    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
-    stario("evaluate", "blind.csv").assert_one_line_error("truth")
 
 
 @pytest.mark.usefixtures("no_figures")

@@ -1,5 +1,3 @@
-"""`run --report`, `run --view`, `compare --report` and `live` as users call them."""
-
 import json
 import logging
 import socket
@@ -54,6 +52,7 @@ def test_compare_writes_a_report_of_what_is_known(stario, recording, no_figures,
         text = (tmp_path / "told" / name / "report.html").read_text()
         assert {label for label in TRACK_LABELS if f"</svg>{label}</button>" in text} == labels
         assert "filter, as in a stream" not in text
+        assert ("Accuracy against ground truth" in text) == ("truth" in labels)
 
 
 def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures, monkeypatch):
@@ -86,7 +85,6 @@ def test_live_refuses_a_port_in_use(stario):
 
 
 def test_training_without_a_terminal_tells_its_progress_and_the_time_left(monkeypatch, capsys):
-    """Steps of four seconds: a line every third of them, none of seconds that had no step."""
     clock = count(0.0, 4.0)
     monkeypatch.setattr("stario.fusion.commands.common.monotonic", lambda: next(clock))
     with training_progress(100) as progress:

@@ -1,5 +1,3 @@
-"""The command train: weights that can be run, what it learned from, what it refuses."""
-
 import json
 import signal
 from dataclasses import replace
@@ -19,7 +17,6 @@ from stario.sequences.readers.generic_csv import read_generic_csv
 
 @pytest.fixture
 def tiny(tmp_path):
-    """A recipe of one step."""
     path = tmp_path / "tiny.json"
     path.write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
     return path

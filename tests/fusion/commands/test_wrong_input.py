@@ -1,5 +1,3 @@
-"""Wrong input to the commands: one line that names what is wrong and what fixes it."""
-
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -55,14 +53,11 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
         (["run", "RECORDING", "--gyro-unit", "rpm"], [".csv: --gyro-unit: found 'rpm'"]),
         (["inspect", "RECORDING", "--axes=x,y"], [".csv: --axes: found 'x,y'"]),
         (["inspect", "RECORDING", "--imu-topic", "/imu"], [".csv: --imu-topic: found"]),
-        (["run", "RECORDING", "--axes", "y,x,z"], ["axes", "left-handed"]),
-        (["run", "RECORDING", "--gravity", "gone"], ["gravity", "gone"]),
         (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
         (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
         (["convert", "RECORDING", "walk.txt"], [".txt", ".csv, .h5", "--to"]),
         (["live", "--port", "0", "--phyphox", "file:///etc/passwd"], ["phyphox"]),
         (["run", "RECORDING", "--origin", "11.5"], ["--origin"]),
-        (["run", "RECORDING", "--origin", "here"], ["--origin"]),
         (["run", "RECORDING", "--satellites", "yes"], ["--satellites"]),
         (["run", "RECORDING", "--waypoints", "no"], ["--waypoints"]),
         (["run", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),
@@ -73,13 +68,9 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
             ["nothere", "default, first-stage, open or walks-36min"],
         ),
         (["run", "RECORDING", "--config", "."], [".", "TOML or JSON"]),
-        (["simulate", "no/such/folder.csv"], ["folder"]),
         (["simulate", "a.csv", "--seconds", "1e9"], ["duration", "10000 s at 200 Hz"]),
-        (["simulate", "a.csv", "--seconds", "2001", "--rate", "1000"], ["2000 s at 1000 Hz"]),
         (["simulate", "a.h5"], ["a.h5", ".csv", "convert"]),
         (["convert", "RECORDING", "a.h5", "--to", "csv"], ["a.h5", "csv"]),
-        (["convert", "RECORDING", "a.csv", "--to", "euroc"], ["a.csv", "euroc"]),
-        (["simulate", "a.csv", "--carry", "drone"], ["carry", "drone"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
         (["train"], ["PATH", "--data"]),
         (["train", "--data", ".", "--where", "person=dan"], ["--where: found use with --data"]),
@@ -126,7 +117,7 @@ def test_an_option_that_would_do_nothing_is_refused(stario, recording, tmp_path,
 @pytest.mark.parametrize(
     ("command", "content", "named"),
     [
-        ("compare", '{"filter": {"speed": 1}}', "filter.speed"),
+        ("compare", '{"filter": {"speed": 1}}', "settings.json: filter.speed"),
         ("run", "{", "settings.json"),
         ("train", '{"speed": 1}', "settings.json: speed"),
         ("train", '{"epochs": 0}', "settings.json: epochs"),

@@ -1,5 +1,3 @@
-"""Networks alone, on a recording and by groups, with a known share of the true displacements."""
-
 import csv
 import json
 from collections.abc import Mapping
@@ -73,7 +71,6 @@ class Stub:
 
 
 def errors_of(recording: ImuSequence, model: Model) -> tuple[dict[str, float], pd.DataFrame]:
-    """Figures, and blocks of squared errors."""
     return recording_errors(recording, [piece_of(model, s) for s in streams_of(recording)])
 
 

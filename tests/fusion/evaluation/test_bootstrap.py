@@ -1,5 +1,3 @@
-"""Intervals of error ratios and ranks: their width, what is drawn, and the verdict on them."""
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +14,6 @@ Errors = dict[tuple[str, str, str], np.ndarray]
 
 
 def table_of(networks: dict[str, list[Errors]]) -> pd.DataFrame:
-    """Errors of networks, by seed."""
     return joined(
         pd.DataFrame({"squares": squares, "count": 1.0, "block": range(len(squares))}).assign(
             set=s, group=group, recording=name, network=network, seed=seed,
@@ -45,7 +42,6 @@ def interval_of(pairs: Sequence[tuple[Any, Any]], groups: Sequence[str] | None =
 
 
 def recordings(ratios: Sequence[float]) -> list[tuple[Any, Any]]:
-    """A recording of five blocks for each ratio of errors."""
     theirs = np.random.default_rng(0).uniform(1.0, 2.0, (len(ratios), 5))
     return [(ratio**2 * blocks, blocks) for ratio, blocks in zip(ratios, theirs, strict=True)]
 
@@ -145,7 +141,6 @@ def test_seeds_are_averaged_over_common_recordings_only():
 
 
 def test_sets_have_equal_weights_however_many_recordings_they_have():
-    """Eight times the error on the two recordings of one set, none on the six of the other."""
     other = part(errors(8.0), slice(0, 3, 2)) | part(errors(1.0), slice(1, None, 2))
     found = ranked({"StarIO": [errors(1.0)], "other": [other]})["other"]["ratio"]
     assert found.ratio == pytest.approx(np.sqrt(8.0))

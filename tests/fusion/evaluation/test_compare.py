@@ -1,8 +1,6 @@
-"""Comparison of tracks, and folders of results, which replace earlier ones whole or not at all."""
-
 import errno
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -173,24 +171,7 @@ def test_a_folder_holds_what_was_measured(folder, compared, walk):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_a_run_writes_its_files(tmp_path, compared, walk):
-    track = compared.tracks["track"]
-    alone = Comparison(walk, {"track": track}, {"track": compared.metrics["track"]})
-    files = write_run(tmp_path / "run", alone, CONFIG, ORIGIN)
-    assert {p.name for p in files} == {
-        "track.tum", "track.npz", "metrics.json", "config.json", "run.json", "health.json",
-        "plan.png", "error.png", "innovations.png",
-    }  # fmt: skip
-    words = json.loads((tmp_path / "run/metrics.json").read_text())["conventions"]
-    assert set(words) == KEYS | {"alignment", "horizontal"}
-    assert sorted(files) == sorted((tmp_path / "run").iterdir())
-    health = json.loads((tmp_path / "run/health.json").read_text())
-    assert health == json.loads(json.dumps(asdict(track.health)))
-
-
-@pytest.mark.usefixtures("blank_figures")
 def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(tmp_path, compared, walk):
-    """The first has truth, a report and the filter's track; a file of the user's stays."""
     track = compared.tracks["track"]
     two = {"track": track, "filtered": compared.tracks["filtered"]}
     write_run(tmp_path, Comparison(walk, two, {name: {} for name in two}), CONFIG, ORIGIN)

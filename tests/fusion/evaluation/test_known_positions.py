@@ -1,5 +1,3 @@
-"""Known positions: the error at them, and what they contradict."""
-
 import re
 import warnings
 from dataclasses import replace

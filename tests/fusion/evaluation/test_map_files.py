@@ -1,5 +1,3 @@
-"""Tracks as GeoJSON and GPX, as other programs read them."""
-
 import re
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -82,7 +80,6 @@ def test_a_gap_parts_the_line(tmp_path):
 
 
 def test_waypoints_with_coordinates_place_a_track_that_did_not_use_them():
-    """The track's own frame is turned by 90 degrees and shifted."""
     place = Georeference(48.1, 11.5, np.radians(90.0))
     xy = np.array([[2.0, 0.0], [20.0, 0.0], [38.0, 0.0]])
     time = np.array([1.0, 10.0, 19.0])

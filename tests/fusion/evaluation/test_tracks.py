@@ -1,5 +1,3 @@
-"""Tracks without a filter: the IMU alone, chained displacements, steps."""
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -204,7 +202,6 @@ def test_a_real_walk_is_reproduced_within_4_percent_of_its_length():
 
 
 def test_position_and_heading_are_kept_across_a_gap():
-    """A straight, a quarter turn and another straight; the gap lies in the second straight."""
     time = np.arange(0.0, 40.0, 0.01)
     rate = np.where((time > 10.0) & (time < 12.0), 0.25 * np.pi, 0.0)
     phase = 2.0 * np.pi * RATE * time

@@ -1,5 +1,3 @@
-"""Fixes before, within and after gaps in which the pedestrian turns unobserved."""
-
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any

@@ -1,5 +1,3 @@
-"""The magnetic bearing: what it observes, what it must not observe, and how robust it is."""
-
 import math
 from dataclasses import replace
 
@@ -35,7 +33,6 @@ FIELD_W = np.array([15.0, 12.0, -40.0])
 
 
 def measured(sequence: ImuSequence, rate: float = 25.0, seed: int = 0) -> Magnetometer:
-    """Samples of the field in a place without steel, with white noise of 1 uT."""
     truth = sequence.truth
     time = np.arange(truth.time[0], truth.time[-1], 1.0 / rate)
     field = truth.at(time).attitude_WB.inv().apply(FIELD_W)
@@ -239,10 +236,11 @@ def test_a_contradicting_field_turns_no_track(biased_walk, oracle, biased_track,
 
 def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model):
     navigator = Navigator(still_model, CONFIG)
-    for time, field in ((0.0, FIELD_W), (0.0, FIELD_W), (1.0, [np.nan, 0.0, 0.0])):
+    wrong = (0.0, FIELD_W), (-0.5, FIELD_W), (1.0, [np.nan, 0.0, 0.0]), (1.5, [np.inf, 0.0, 0.0])
+    for time, field in ((0.0, FIELD_W), *wrong):
         navigator.push_magnetometer(time, field)
-    assert navigator.health.fields_dropped == 2
-    assert "magnetometer samples dropped: 2" in navigator.health.lines()
+    assert navigator.health.fields_dropped == len(wrong)
+    assert "magnetometer samples dropped: 4" in navigator.health.lines()
 
 
 def test_a_field_on_another_clock_is_reported(biased_walk, still_model):

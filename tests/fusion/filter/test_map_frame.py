@@ -1,5 +1,3 @@
-"""Fixes in map coordinates, after gaps, and refused ones, for the filter and for the graph."""
-
 from typing import Any
 
 import numpy as np

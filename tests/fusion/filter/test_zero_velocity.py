@@ -1,5 +1,3 @@
-"""Rest: detected where nothing moves, never in motion; informative about bias and velocity."""
-
 import itertools
 from dataclasses import replace
 
@@ -29,7 +27,6 @@ def on_table(seconds: float, rate=100.0, turn=0.0, bias=BIAS) -> ImuSequence:
 
 
 def at_rest(intervals: list[ImuInterval]) -> list[bool]:
-    """Whether the device was at rest at the end of each interval."""
     states = itertools.accumulate(
         intervals, lambda state, each: state.after(each, CONFIG.filter), initial=Stillness()
     )

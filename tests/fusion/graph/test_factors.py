@@ -1,5 +1,3 @@
-"""Jacobians of the graph's terms against finite differences, and what they must not observe."""
-
 from typing import Any
 
 import gtsam

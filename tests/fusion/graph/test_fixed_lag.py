@@ -1,5 +1,3 @@
-"""The fixed-lag graph of a stream: against filter and batch, with fixes and faults."""
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""The batch graph on simulated walks: against the filter, under symmetries, faults and fixes."""
-
 from dataclasses import replace
 from typing import Any
 
@@ -56,7 +54,6 @@ def test_states_are_at_the_filters_times_with_a_smaller_covariance(walk, oracle,
 
 
 def test_the_track_follows_the_imu_between_keyframes(walk, make_oracle):
-    """Velocity is the derivative of position, and nothing jumps at keyframes."""
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
     track = graph(oracle).run(walk).trajectory
     step = np.diff(track.time)[:, None]
@@ -158,7 +155,6 @@ def test_a_gap_is_crossed_and_its_sigma_covers_the_error(walk, make_oracle, with
 
 @pytest.mark.parametrize("time", [10.0, 10.37, 10.4])
 def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(walk, make_oracle, time):
-    """On a keyframe, between the filter's states, and on one of them."""
     walk = walk.slice(0.0, 15.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     truth = walk.truth.at(np.array([time])).position_W[0]
@@ -236,19 +232,3 @@ def test_accurate_positions_with_an_unknown_height_need_no_fall_back(walk, make_
     for state, p_W in ((states[-1], states[-1].p_W), (track, track.trajectory.position_W[-1])):
         true = walk.truth.at(np.array([min(np.atleast_1d(state.time)[-1], 14.0)])).position_W[0]
         assert np.linalg.norm((p_W - true)[:2]) < 0.5
-
-
-def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(make_walk, make_oracle):
-    walk = make_walk(1, 40.0)
-    R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
-    truth = walk.truth.at(np.array([5.0, 30.0]))
-    p_W = R.apply(truth.position_W) + shift
-    fixes = [position_fix(t, p, 0.01 * np.eye(3)) for t, p in zip((5.0, 30.0), p_W, strict=True)]
-    track = graph(make_oracle(walk, walk.truth, CONFIG), CONFIG).run(walk, fixes=fixes)
-    times = np.clip(track.time, 0.0, walk.time[-1])
-    error = track.trajectory.position_W - R.apply(walk.truth.at(times).position_W) - shift
-    assert np.linalg.norm(error, axis=1).max() < 1.0
-    P = track.covariance[:, 6:9, 6:9]
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
-    assert 0.05 < np.median(nees) < 2.4  # median of chi-square with 3 DoF: 2.4
-    assert track.health.fixes["applied"] == 2

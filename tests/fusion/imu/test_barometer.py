@@ -1,5 +1,3 @@
-"""Averaged heights by the pressure: what is a climb, a step of the air, or nothing."""
-
 import numpy as np
 import pytest
 
@@ -90,19 +88,6 @@ def test_a_puff_of_air_is_held_back_and_nothing_else():
     known = [each for each in found if each is not None]
     assert len(known) < len(found)
     assert all(each.rate == each.stepped == 0.0 for each in known)
-
-
-def test_late_repeated_and_impossible_pressures_are_refused():
-    buffer = HeightBuffer()
-    assert buffer.add(0.9, 1000.01, 1.0)
-    assert buffer.add(1.0, 1000.0, 1.0)
-    assert not buffer.add(1.0, 1000.0, 1.0)
-    assert not buffer.add(0.5, 1000.0, 1.0)
-    for pressure in (0.0, float("nan"), 100_000.0, 101.3):
-        assert not buffer.add(2.0, pressure, 1.0)
-    assert not buffer.add(float("nan"), 1000.0, 1.0)
-    assert buffer.at(1.2) is not None
-    assert not buffer.add(1.05, 1000.0, 1.2)
 
 
 def test_one_pressure_a_second_is_enough_and_none_is_none():

@@ -1,5 +1,3 @@
-"""Intervals cover every moment once; windows span no gap and do not depend on the filter."""
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,5 +1,3 @@
-"""Gaps of the samples, and the magnetometer's rows between them."""
-
 import math
 from dataclasses import replace
 
@@ -135,16 +133,6 @@ def test_a_wild_field_time_costs_one_field(wild):
         buffer.add(time + wild if k == 100 else time, noisy(k), now=time)
         if k != 100:
             assert buffer.at(time) is not None
-
-
-def test_late_repeated_and_infinite_fields_are_refused():
-    buffer = FieldBuffer()
-    assert buffer.add(1.0, FIELD_B, now=1.0)
-    assert not buffer.add(1.0, FIELD_B, now=1.0)
-    assert not buffer.add(0.5, FIELD_B, now=1.0)
-    assert not buffer.add(1.5, np.full(3, math.inf), now=1.5)
-    assert buffer.at(1.05) is FIELD_B
-    assert buffer.at(1.2) is None
 
 
 def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_counted():

@@ -1,9 +1,8 @@
-"""Windows of the network: inference, and the direction of its displacements."""
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulated import Still
 from support import Altered, Counting, stream
 
 from stario.fusion import FilterConfig, Navigator, NavigatorConfig
@@ -57,18 +56,11 @@ def test_a_model_without_memory_refuses_that_of_another(walk, still_model):
         Navigator(still_model).restore(navigator.snapshot())
 
 
-class Walking:
-    """Predicts 1.5 m ahead for every window, with a sigma of 1 cm per axis."""
-
-    def predict(self, windows):
-        n = len(windows)
-        return np.tile([1.5, 0.0, 0.0], (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1))
-
-
 def test_slopes_and_missing_samples_make_displacements_less_certain(walk, without):
     """A floor of unknown slope (0.03) the height, missing samples all axes: sigma is doubled."""
     holed = without(walk, (walk.time > 6.0) & (walk.time < 6.1))
-    measurements = Navigator(Walking(), NavigatorConfig()).observe(holed).measurements
+    ahead = Still((1.5, 0.0, 0.0), 3 * [1e-4])
+    measurements = Navigator(ahead, NavigatorConfig()).observe(holed).measurements
     intervals, _ = cut_recording(holed, NavigatorConfig())
     known = [
         (interval.window.flagged, measured.covariance_N)

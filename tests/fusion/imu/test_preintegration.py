@@ -33,13 +33,11 @@ def state() -> tuple[np.ndarray, ...]:
 
 
 def moved(x: tuple[np.ndarray, ...], error: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The state displaced by a right-invariant error."""
     R, v, p = exp_se23(error[:9])
     return R @ x[0], R @ x[1] + v, R @ x[2] + p, x[3] + error[9:12], x[4] + error[12:]
 
 
 def difference(x: tuple[np.ndarray, ...], y: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Right-invariant error of x against y."""
     R = x[0] @ y[0].T
     return np.concatenate([log_se23(R, x[1] - R @ y[1], x[2] - R @ y[2]), x[3] - y[3], x[4] - y[4]])
 
@@ -74,7 +72,6 @@ def integrated(dt, rate, force) -> tuple[np.ndarray, np.ndarray]:
 
 
 def interpolated(t: np.ndarray, values: np.ndarray, finer: int) -> np.ndarray:
-    """Linear interpolation between samples, at `finer` times their rate."""
     fine = np.linspace(t[0], t[-1], finer * (len(t) - 1) + 1)
     return np.stack([np.interp(fine, t, column) for column in values.T], axis=1)
 

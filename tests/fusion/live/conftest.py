@@ -1,5 +1,3 @@
-"""Pushes of a recording as a phone sends them, a navigator with a cheap network, and requests."""
-
 import errno
 import json
 import subprocess
@@ -26,24 +24,20 @@ class SteadyWalk:
 
 
 def send(client, bodies, query=""):
-    """Post pushes; return the answers."""
     return [client.post(f"/data{query}", content=body) for body in bodies]
 
 
 def lines(walk, count=None):
-    """JSON lines of a walk's samples."""
     rows = zip(walk.time[:count].tolist(), walk.gyro.tolist(), walk.accel.tolist(), strict=False)
     return [json.dumps({"device": "rig", "t": t, "gyro": g, "accel": a}) for t, g, a in rows]
 
 
 def send_lines(client, posted):
-    """Post JSON lines; return the answer."""
     headers = {"content-type": "Application/X-NDJSON; charset=utf-8"}
     return client.post("/data", content="\n".join(posted), headers=headers)
 
 
 def command(client, name, device="phone", **content):
-    """Post a command of the page; return the answer."""
     return client.post("/command", json={"device": device, "command": name, **content})
 
 
@@ -59,7 +53,6 @@ def added(bodies, name, values, every=1):
 
 
 def ends(session):
-    """Where the drawn track of a session ends: x, y, z [m]."""
     return session.track.drawn.points[-1][1:4]
 
 
@@ -77,7 +70,6 @@ def end_of_rerun(session, navigator):
 
 
 def full_disk(*arguments, **more):
-    """Fail as a write on a full disk."""
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
@@ -117,7 +109,6 @@ def pushes(walk):
 
 @pytest.fixture
 def serve(tmp_path, new_navigator):
-    """Start a server on loopback."""
     running = []
 
     def start(**options):

@@ -1,7 +1,3 @@
-"""Connections: whose are kept, how long, and what may be posted."""
-
-from __future__ import annotations
-
 import asyncio
 import json
 import os

@@ -1,7 +1,3 @@
-"""Devices of the server, and what is drawn of their tracks."""
-
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +14,6 @@ from .conftest import command, full_disk, send
 
 @pytest.fixture
 def full(client, hub, pushes):
-    """A hub with as many devices as it may have."""
     for k in range(MAX_DEVICES):
         send(client, pushes(f"phone{k}", seconds=1.0))
     return hub

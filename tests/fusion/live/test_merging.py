@@ -1,7 +1,3 @@
-"""Readings of several sensors, in any order, become samples."""
-
-from __future__ import annotations
-
 import csv
 import json
 import random
@@ -75,15 +71,6 @@ def test_batches_of_any_size_give_the_same_samples(sizes):
         samples += merger.add(readings[begin:end])
         begin = end
     assert samples == whole
-
-
-def test_repeated_and_late_readings_are_dropped_and_counted():
-    readings = phone(linear("gyroscope", 100, 0), linear("totalacceleration", 100, 0))
-    merger = Merger()
-    first = merger.add(readings)
-    assert merger.add(readings) == []  # the app repeats a push
-    assert merger.dropped == {"late": len(readings)}
-    assert len(first) == 200
 
 
 def test_a_gap_of_the_accelerometer_is_not_interpolated():

@@ -1,5 +1,3 @@
-"""Messages of devices are read correctly, or refused with the name of the invalid field."""
-
 import json
 from contextlib import suppress
 
@@ -29,7 +27,6 @@ json_values = st.recursive(
 
 
 def changed(message: dict, path: tuple, value: object) -> bytes:
-    """The message with one field replaced, as JSON."""
     copy = json.loads(json.dumps(message))
     inner = copy
     for key in path[:-1]:

@@ -1,5 +1,3 @@
-"""Samples of a phone running phyphox are recorded, whatever is done on the phone."""
-
 import json
 import threading
 import time
@@ -37,7 +35,6 @@ class FakePhone:
         self.count, self.measuring, self.cleared = 0, False, True
 
     def answer(self, path):
-        """Answer a request."""
         url = urlsplit(path)
         if url.path == "/config":
             return self.config

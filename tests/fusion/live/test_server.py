@@ -1,5 +1,3 @@
-"""The server accepts pushes, refuses malformed ones, and draws the same track as `stario run`."""
-
 import json
 from dataclasses import replace
 
@@ -109,7 +107,6 @@ def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes,
 
 
 def scaled(bodies, factor):
-    """Pushes of an accelerometer with another unit or sign."""
     for body in bodies:
         message = json.loads(body)
         for entry in message["payload"]:
@@ -145,16 +142,26 @@ def test_malformed_pushes_between_others_are_refused_and_change_nothing(client, 
     assert one.track.drawn.points == other.track.drawn.points
 
 
-def test_a_full_disk_is_reported_and_affects_no_other(client, hub, pushes, monkeypatch):
+def test_a_full_disk_is_told_until_it_has_space_and_affects_no_other(
+    client, hub, pushes, monkeypatch
+):
     append = LiveFile.append
 
     def only_one_is_full(file, *arguments):
         (full_disk if "full" in file.path.name else append)(file, *arguments)
 
+    bodies = pushes("full", seconds=2.0)
+    send(client, bodies[:5])
     monkeypatch.setattr(LiveFile, "append", only_one_is_full)
-    full, phone = (send(client, pushes(device, seconds=1.0)) for device in ("full", "phone"))
+    full, phone = send(client, bodies[5:6]), send(client, pushes("phone", seconds=1.0))
     assert (full[-1].status_code, "No space" in full[-1].json()["error"]) == (507, True)
     assert all(answer.is_success for answer in phone)
+    session = hub.sessions["full"]
+    assert "No space left" in session.status()["problem"]
+    monkeypatch.setattr(LiveFile, "append", append)
+    assert send(client, bodies[5:])[0].is_success
+    assert session.status()["problem"] == ""
+    assert len(read_recording(session.track.path)) == session.track.samples == 200
 
 
 def test_a_fix_that_cannot_be_written_moves_nothing(client, hub, pushes, monkeypatch):

@@ -1,5 +1,3 @@
-"""Runs of the table: completed once, resumed after a kill; only new ones are completed later."""
-
 import json
 import os
 import pickle

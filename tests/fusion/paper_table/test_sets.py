@@ -1,5 +1,3 @@
-"""Splits of recordings, what a training passes on, and rows from known errors."""
-
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
@@ -32,7 +30,6 @@ needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no da
 
 
 def archived(path: Path, names: Iterable[str]) -> None:
-    """Write an archive of recordings of two samples."""
     time, zero = np.arange(2) / 100.0, np.zeros((2, 3))
     write_archive(path, [ImuSequence(name, time, zero, zero) for name in names])
 

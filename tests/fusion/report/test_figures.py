@@ -1,7 +1,3 @@
-"""Figures of the report, their curves and the map's tiles, and the 3-D view."""
-
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import Any
@@ -39,7 +35,6 @@ def drawn_map(track: Trajectory, *more: Any) -> go.Figure:
 
 
 def trace_of(figure: go.Figure, **properties: Any) -> Any:
-    """Return the first trace with these properties."""
     return next(t for t in figure.data if all(t[key] == v for key, v in properties.items()))
 
 
@@ -172,7 +167,6 @@ SIGMA = np.array([*_POSE, 1e-3, 2e-3, 3e-3, 0.07, 0.08, 0.09])
 
 
 def along_y(yaw: float = 0.0) -> Track:
-    """A track at 1.5 m/s along y."""
     count = len(TIME)
     covariance = np.tile(np.diag(SIGMA**2), (count, 1, 1))
     covariance[:, 6, 7] = covariance[:, 7, 6] = 0.05

@@ -1,7 +1,3 @@
-"""Findings of a run's health: which there are, how severe, and the numbers and advice in them."""
-
-from __future__ import annotations
-
 import pytest
 from recorded import DATA
 from told import health_verdict as findings
@@ -63,6 +59,8 @@ NOTHING = "nothing"
         (GAPS | {"gaps": [(5.0, 0.25), (7.0, 0.25)]}, [], "gaps", ""),
         (GAPS | {"gaps": [(5.0, 0.15), (5.6, 0.15), (6.2, 0.15)]}, [], "gaps", ""),
         (GAPS | {"longest_gap": 4.0}, ["gaps"], "", "4.00 s"),
+        (GOOD | {"corrections": [(93.2, 4.0, 0.5, "magnetic field")]}, ["corrections"], "",
+         "4.0 m and 29 degrees at 93.2 s: magnetic field"),
     ],
 )  # fmt: skip
 def test_what_stands_out_is_found_and_every_warning_has_advice(health, warned, noted, words):

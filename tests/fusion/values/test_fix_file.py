@@ -1,5 +1,3 @@
-"""Files of fixes: columns, units, and errors that name the line."""
-
 import numpy as np
 import pytest
 

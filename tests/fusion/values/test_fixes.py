@@ -1,5 +1,3 @@
-"""Absolute fixes: on time, late or early, in stream and batch, and the map frame they define."""
-
 import numpy as np
 import pytest
 import support
@@ -30,7 +28,6 @@ def model(walk, make_oracle):
 
 @pytest.fixture(scope="module")
 def fixed(walk, model):
-    """The filter's track of the walk with the fixes of `fixes_of`."""
     return Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes_of(walk))
 
 
@@ -157,7 +154,6 @@ def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk):
 
 @pytest.mark.parametrize("turn", [0.0, -2.5])
 def test_two_positions_determine_the_position_and_direction_of_a_track(walk, model, turn):
-    """The map frame is turned and shifted relative to the walk's by any amount."""
     R, shift = about_z(turn).as_matrix(), np.array([5e3, -2e4, 30.0])
     places = ((t, R @ truth_at(walk, t)[0] + shift) for t in (4.0, 6.0, 28.0, 29.6))
     fixes = [position_fix(t, place, 1e-4 * EYE) for t, place in places]
@@ -229,12 +225,6 @@ def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(walk, mo
         assert np.linalg.norm(error) < 0.5 + 0.8 * off
 
 
-def test_positions_too_close_together_do_not_turn_the_map_frame(walk, model):
-    fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
-    track = Navigator(model, CONFIG, backend="ekf").run(walk.slice(0.0, 8.0), fixes=fixes)
-    assert track.health.fixes == {"applied": 1, "yaw not known": 2}
-
-
 def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model):
     """However the walk lies in the map, the error is within the sigma; the pivot is sure."""
     fix, walk = position_fix(5.0, truth_at(walk, 5.0)[0], 0.01 * EYE), walk.slice(0.0, 12.0)
@@ -274,19 +264,6 @@ def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model):
 )
 def test_an_invalid_fix_has_a_fault(fix, reason):
     assert fix.fault() == reason
-
-
-def test_invalid_fixes_are_refused_and_counted(walk, model):
-    short = walk.slice(0.0, 6.0)
-    bad = [position_fix(5.0, [np.nan, 0, 0], EYE), yaw_fix(5.0, 90.0, 0.1)]
-    expected = {"value that is not finite": 1, "yaw not in radians": 1}
-    track = Navigator(model, CONFIG, backend="ekf").run(short, fixes=bad)
-    assert track.health.fixes == expected
-    navigator = Navigator(model, CONFIG)
-    streamed(navigator, short, bad, 0.2)
-    assert navigator.health.fixes == expected
-    assert np.isfinite(navigator.state.covariance).all()
-    assert navigator.state.map_frame == 0
 
 
 def test_the_covariance_of_an_exact_fix_has_a_floor(walk, model):

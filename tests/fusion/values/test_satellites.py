@@ -1,5 +1,3 @@
-"""A receiver's positions as fixes: what they tell, and what their errors do to a track."""
-
 from dataclasses import replace
 from typing import Any
 

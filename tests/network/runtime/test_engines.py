@@ -1,5 +1,3 @@
-"""Both engines give what the network in training gives, on any windows, in any process."""
-
 import pickle
 import subprocess
 import sys
@@ -75,7 +73,6 @@ def assert_same(engine: Engine, network: DisplacementNetwork, windows: Float32Ar
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_graph_gives_what_the_network_gives(seed):
-    """For any weights: on any number of windows, on a walk, at rest and under violent motion."""
     network = randomised_network(seed)
     engine = engine_of(network)
     (stream,) = world_streams(simulate_imu(generate_walk(3, duration=8.0), seed=3))

@@ -1,5 +1,3 @@
-"""Parameters, operations, time and memory of the networks."""
-
 import warnings
 
 import pytest

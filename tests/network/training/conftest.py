@@ -1,5 +1,3 @@
-"""A finished training run, and its model."""
-
 import pytest
 from training_runs import narrow, run
 
@@ -25,7 +23,6 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def model(finished, tmp_path):
-    """A copy of the trained model and its card."""
     path = tmp_path / "model.safetensors"
     path.write_bytes(finished[0].read_bytes())
     card_path(path).write_bytes(card_path(finished[0]).read_bytes())

@@ -43,7 +43,6 @@ def path(speed: float = 1.0, yaw: float = 0.0) -> Trajectory:
 
 
 def stream_of(trajectory: Trajectory, name: str = "path") -> WorldStream:
-    """The measurements of a perfect IMU along a trajectory."""
     recording = simulate_imu(trajectory, errors=PERFECT_IMU, name=name)
     (stream,) = world_streams(recording, attitude="true")
     return stream
@@ -202,27 +201,6 @@ def test_weights_are_per_second_of_stream_and_no_window_extends_past_its_end():
     assert float(displacement[:, 2].max()) < 1.81
 
 
-def mapped(stream: WorldStream, folder: Path) -> WorldStream:
-    """The same stream in memory-mapped files."""
-    for name in ("imu_W", "position_W", "facing_W"):
-        np.save(folder / f"{stream.name}-{name}.npy", getattr(stream, name))
-    imu_W, position_W, facing_W = (
-        np.load(folder / f"{stream.name}-{name}.npy", mmap_mode="r")
-        for name in ("imu_W", "position_W", "facing_W")
-    )
-    return WorldStream(stream.name, imu_W, position_W, facing_W)
-
-
-def test_memory_mapped_streams_give_the_same_windows(tmp_path):
-    streams = [stream_of(path(speed), f"path-{speed}") for speed in (1.0, 1.4, 0.8)]
-    files = [mapped(stream, tmp_path) for stream in streams]
-    weights = [1.0, 0.3, 2.0]
-    memory, disk = (WindowSampler(s, weights, Augmentation(), seed=5) for s in (streams, files))
-    for _ in range(3):
-        for expected, found in zip(memory.batch(64), disk.batch(64), strict=True):
-            assert torch.equal(expected, found)
-
-
 def test_ten_hours_on_disk_are_not_loaded_into_memory(tmp_path):
     statm = Path("/proc/self/statm")
     if not statm.exists():
@@ -279,7 +257,6 @@ def test_a_swing_continues_from_one_window_to_the_next():
 
 
 def test_windows_do_not_depend_on_where_the_device_points():
-    """In the device's heading frame, a path and its rotated copy give the same batch."""
     plain = replace(YAW_ONLY, any_yaw=0.0, yaw=0.0)
     rotated = stream_of(path(yaw=2.0))
     first, second = (WindowSampler([s], [1.0], plain, seed=4).batch(16) for s in (STREAM, rotated))

@@ -1,5 +1,3 @@
-"""Checkpoints: resumed exactly, by one process at a time."""
-
 import os
 import sys
 from dataclasses import replace

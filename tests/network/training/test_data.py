@@ -53,7 +53,6 @@ def test_streams_are_drawn_alike_unless_they_have_a_weight_or_more_motion():
 
 
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
-    """Share of drawn windows by name of stream."""
     found: dict[str, float] = {}
     for one, weight in zip(material.streams, material.weights, strict=True):
         starts = max(0, len(one) - reach + 1)

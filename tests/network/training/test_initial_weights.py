@@ -1,6 +1,3 @@
-"""What a training begins with: recipe and initial weights."""
-
-import json
 import math
 from dataclasses import replace
 
@@ -160,10 +157,3 @@ def test_an_invalid_recipe_is_refused(values, field):
     with pytest.raises(ConfigError) as caught:
         training_config(values)
     assert caught.value.field == field
-
-
-def test_a_recipe_survives_a_round_trip_through_json():
-    values = json.loads(json.dumps({"batch": 8, "augmentation": {"speeds": [0.7, 1.5]}}))
-    config = training_config(values)
-    assert config.batch == 8
-    assert config.augmentation.speeds == (0.7, 1.5)

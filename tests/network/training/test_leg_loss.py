@@ -1,5 +1,3 @@
-"""Losses: along legs between known positions, and of held-out data."""
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -167,7 +165,6 @@ def test_direction_loss_and_its_gradient_follow_the_equations(drawn):
 
 
 def rotated(stream: WorldStream, yaw: float) -> WorldStream:
-    """The same walk in a world rotated about the vertical."""
     R = about_z(yaw).as_matrix()
     imu_W = np.concatenate([part @ R.T for part in np.split(stream.imu_W, 2, axis=1)], axis=1)
     return replace(

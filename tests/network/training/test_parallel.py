@@ -1,5 +1,3 @@
-"""Training under torch's launcher: the same run, shared by two processes."""
-
 import json
 import os
 import subprocess
@@ -56,7 +54,6 @@ def launched(script: Path, folder: Path, processes: int, network: str, stop: int
 
 
 def epoch_errors(folder: Path) -> list[float]:
-    """Training and validation error of each epoch."""
     log = json.loads((folder / "log.json").read_text())
     return [r[name] for r in log for name in ("training_error", "validation_error")]
 

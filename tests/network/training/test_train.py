@@ -1,5 +1,3 @@
-"""Training: what a run writes, and the weights it keeps."""
-
 import math
 from dataclasses import replace
 from itertools import count
@@ -35,7 +33,6 @@ def test_training_learns(finished):
 
 
 def test_an_epoch_reports_its_speed(tmp_path, monkeypatch):
-    """With a clock that advances by a second on every reading."""
     clock = count()
     monkeypatch.setattr("stario.network.training.train.perf_counter", lambda: float(next(clock)))
     reports = []

@@ -1,10 +1,9 @@
-"""Attitude from gravity and levelling, against simulated ground truth."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from walked import walked
 
-from stario.sequences import STANDARD_GRAVITY, ImuSequence, WalkStyle, generate_walk
+from stario.sequences import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.attitude.levelling import (
     GravityStart,
     LevelledAttitude,
@@ -14,14 +13,15 @@ from stario.sequences.attitude.levelling import (
 )
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.simulation.carrying import CARRYING_MODES
-from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
+from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def simulated_walk(seed: int, seconds: float, carry: str, errors: ImuErrors) -> ImuSequence:
-    style = WalkStyle(carry=carry, mount_rotvec=(0.4, -0.7, 1.1))
-    return simulate_imu(generate_walk(seed, seconds, style=style), 200.0, errors, seed)
+    return walked(
+        seed, seconds, errors, seed, rate=200.0, carry=carry, mount_rotvec=(0.4, -0.7, 1.1)
+    )
 
 
 def start_at(R_WB: np.ndarray, turn_rate: float = 0.5) -> GravityStart:
@@ -72,22 +72,6 @@ def test_a_pedestrian_starts_level_to_within_the_stated_sigma(carry):
                 assert errors[-1] < 3 * np.degrees(0.01) + 0.3
     # FilterConfig.tilt_sigma is 0.05 rad (2.9 degrees) for each of two axes; a rig is waved.
     assert np.sqrt(np.mean(np.square(errors))) < 1.4 * 2.9 * np.sqrt(2.0)
-
-
-@pytest.mark.slow
-def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not():
-    levelled, integrated = [], []
-    for seed in range(6):
-        walk = simulated_walk(seed, 90.0, "handheld", PERFECT_IMU)
-        truth = walk.truth.attitude_WB.as_matrix()
-        gyro = walk.gyro + 0.005 * np.eye(3)[seed % 3]
-        R_NB = levelled_attitudes(walk.time, gyro, walk.accel)
-        levelled.append(tilt_error(R_NB, truth[: len(R_NB)]))
-        integrated.append(tilt_error(integrate(truth[0], walk.time, gyro), truth)[: len(R_NB)])
-    assert np.sqrt(np.mean(np.square(levelled))) < 2.0
-    assert np.percentile(levelled, 95) < 4.0
-    assert np.sqrt(np.mean(np.square(integrated))) > 5.0
-    assert np.max(integrated) > 10.0
 
 
 def test_a_grid_rounded_to_beyond_the_last_sample_is_levelled():

@@ -1,5 +1,3 @@
-"""Rotations: exponential and logarithm, products of stacks."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -22,7 +20,6 @@ def test_skew_is_the_cross_product():
 
 
 def test_exp_agrees_with_scipy_and_log_inverts_it():
-    """One by one and in a stack of mixed angles."""
     theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
     expected = Rotation.from_rotvec(theta).as_matrix()
     singly = np.stack([so3.exp_so3(row) for row in theta])

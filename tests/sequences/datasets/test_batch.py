@@ -1,5 +1,3 @@
-"""Batches of recordings, and their split into parts."""
-
 import importlib.resources
 import os
 import time

@@ -1,5 +1,3 @@
-"""Recordings converted to other layouts and archives."""
-
 import logging
 from dataclasses import replace
 
@@ -121,16 +119,6 @@ def test_what_cannot_be_converted_is_refused_with_the_reason(walk, tmp_path):
         with pytest.raises(InputError, match=words):
             convert(recording, tmp_path / name)
     assert [p.name for p in tmp_path.rglob("*")] == ["full", "file"]
-
-
-def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):
-    """Timestamps are unsigned, so both files are shifted together."""
-    sequence = simulate_imu(generate_walk(5, 6.0), 100.0, name="w")
-    truth = sequence.truth
-    early = replace(sequence, truth=replace(truth, time=truth.time - 2.5))
-    convert(early, tmp_path / "w")
-    found = read_recording(tmp_path / "w").truth
-    np.testing.assert_allclose(found.time, truth.time - 2.5, atol=1e-9)
 
 
 @pytest.fixture(scope="module")

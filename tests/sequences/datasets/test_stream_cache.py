@@ -1,5 +1,3 @@
-"""Windows kept on disk, and the files they are kept in."""
-
 import mmap
 import os
 import re
@@ -32,8 +30,6 @@ WALK = simulate_imu(generate_walk(6, 9.0), 100.0, seed=4, name="walk")
 
 
 class Reader:
-    """Reader that counts its calls."""
-
     def __init__(self) -> None:
         self.calls = 0
 

@@ -1,5 +1,3 @@
-"""Figures and tables as they are shown."""
-
 import subprocess
 import sys
 from dataclasses import replace

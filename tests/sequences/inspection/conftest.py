@@ -1,11 +1,7 @@
-"""A walk for the checks of units, axes, times and values."""
-
 import pytest
-
-from stario.sequences import WalkStyle, generate_walk, simulate_imu
+from walked import walked
 
 
 @pytest.fixture(scope="module")
 def walk():
-    level = WalkStyle(mount_rotvec=(0.0, 0.0, 0.0))
-    return simulate_imu(generate_walk(4, 30.0, style=level), rate=200.0)
+    return walked(4, 30.0, rate=200.0, mount_rotvec=(0.0, 0.0, 0.0))

@@ -6,14 +6,15 @@ import pytest
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
+from walked import walked
 
-from stario.sequences import PHONE_IMU, InputError, inspect_recording, simulate_imu, with_units
+from stario.sequences import InputError, inspect_recording, with_units
 from stario.sequences.conventions import SAME_AXES, with_axes, with_conventions
 from stario.sequences.inspection.checks import check_units, unit_findings
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.carrying import CARRYING_MODES
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 
 
 def in_degrees(sequence: ImuSequence) -> ImuSequence:
@@ -27,8 +28,7 @@ def without_gravity(sequence: ImuSequence) -> ImuSequence:
 @pytest.mark.parametrize("carry", CARRYING_MODES)
 def test_walks_pass_and_their_wrong_units_are_named(carry):
     """Swinging arms and pockets rotate the device fast and press it outward, yet units are SI."""
-    style = WalkStyle(carry=carry, preferred_speed=1.4)
-    walk = simulate_imu(generate_walk(1, 30.0, style=style), 100.0, PHONE_IMU, 1)
+    walk = walked(1, 30.0, imu_seed=1, carry=carry, preferred_speed=1.4)
     check_units(walk)
     check_units(walk.without_truth())
     assert "--gyro-unit deg/s" in refusal(in_degrees(walk).without_truth())
@@ -40,14 +40,12 @@ def test_walks_pass_and_their_wrong_units_are_named(carry):
 
 def test_a_hard_shaken_device_and_a_swinging_pocket_pass_but_not_without_gravity():
     """The median norm of its samples exceeds 12.5 m/s^2, yet their average is gravity."""
-    style = WalkStyle(carry="swinging", preferred_speed=2.0)
-    shaken = simulate_imu(generate_walk(1, 10.0, style=style), 200.0, PHONE_IMU, 1)
+    shaken = walked(1, 10.0, imu_seed=1, rate=200.0, carry="swinging", preferred_speed=2.0)
     assert np.median(np.linalg.norm(shaken.accel, axis=1)) > 12.5
     check_units(shaken)
     assert "--gravity removed" in refusal(without_gravity(shaken))
     # Its average force is as large in either unit, but not since it turned about the vertical.
-    style = WalkStyle(carry="pocket", preferred_speed=1.4)
-    swung = simulate_imu(generate_walk(0, 30.0, style=style), 100.0, PHONE_IMU).without_truth()
+    swung = walked(0, 30.0, carry="pocket", preferred_speed=1.4).without_truth()
     assert np.percentile(np.linalg.norm(swung.gyro, axis=1), 95) > 3.0
     assert unit_findings(swung) == []
 
@@ -152,6 +150,7 @@ WRONG = [
     ("accelerometer", lambda w: replace(w, accel=0.5 * w.accel)),
     ("accelerometer", lambda w: replace(w, accel=0.0 * w.accel)),
     ("omit the unit g", lambda w: with_units(w.without_truth(), accel_unit="g")),
+    ("swapped: exchange them", lambda w: replace(w, gyro=w.accel, accel=w.gyro)),
     ("x y z w", shuffled),
     ("found 10 samples/s, .* 50 to 1000; set the app", lambda w: w.select(np.arange(0, 6000, 20))),
     (r"batches: 200 samples/s, most 0\.0001 s apart, .*space their samples evenly", batches),
@@ -193,8 +192,7 @@ def test_bad_samples_do_not_disturb_the_check(walk):
 @pytest.mark.parametrize("carry", ["swinging", "rig", "pocket"])
 def test_gaps_are_not_mistaken_for_wrong_units(carry, period, lost):
     """The device rotates unobserved during gaps; the stretches between determine the units."""
-    style = WalkStyle(carry=carry)
-    walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2).without_truth()
+    walk = walked(2, 60.0, imu_seed=2, carry=carry).without_truth()
     kept = walk.time % period > lost
     gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept])
     check_units(gappy)
@@ -202,8 +200,7 @@ def test_gaps_are_not_mistaken_for_wrong_units(carry, period, lost):
 
 
 def test_stretches_too_short_to_determine_the_units_are_ignored():
-    style = WalkStyle(carry="pocket")
-    walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2)
+    walk = walked(2, 60.0, imu_seed=2, carry="pocket")
     kept = walk.time % 0.9 > 0.6
     check_units(ImuSequence("shreds", walk.time[kept], walk.gyro[kept], walk.accel[kept]))
 
@@ -225,8 +222,9 @@ def test_real_recordings_pass_and_their_wrong_units_are_named():
 
 def test_swapped_gyroscope_axes_are_not_mistaken_for_degrees():
     """A rig turns at 2 rad/s about all axes; the cause is swapped axes, not deg/s."""
-    style = WalkStyle(carry="rig", preferred_speed=1.4, mount_rotvec=(0.0, 0.0, 0.0))
-    walk = simulate_imu(generate_walk(11, 30.0, style=style), 100.0, PHONE_IMU, 11).without_truth()
+    walk = walked(
+        11, 30.0, imu_seed=11, carry="rig", preferred_speed=1.4, mount_rotvec=(0.0, 0.0, 0.0)
+    ).without_truth()
     text = refusal(replace(walk, gyro=walk.gyro[:, [1, 2, 0]]))
     assert "contradict the accelerometer" in text
     assert "--gyro-unit" not in text
@@ -265,19 +263,6 @@ def test_the_unit_of_a_vehicle_that_turns_about_the_vertical_is_asked_for(caplog
     assert ("gyro_unit_open" in codes) == asked
 
 
-def test_advice_on_arrays_names_no_option_of_the_command(walk):
-    walk = walk.without_truth()
-    cases = {
-        "np.radians(gyro)": in_degrees(walk),
-        "9.80665 * accel": replace(walk, accel=walk.accel / STANDARD_GRAVITY),
-        "swapped": replace(walk, gyro=walk.accel, accel=walk.gyro),
-    }
-    for words, wrong in cases.items():
-        with pytest.raises(InputError, match=re.escape(words)) as caught:
-            check_units(wrong)
-        assert "--" not in str(caught.value)
-
-
 def test_a_force_along_minus_z_is_named_for_arrays(walk, caplog):
     """No other sensor tells the sign; a reader has asked for it."""
     down = replace(walk.without_truth(), accel=-walk.accel)
@@ -286,3 +271,48 @@ def test_a_force_along_minus_z_is_named_for_arrays(walk, caplog):
     assert not caplog.text
     check_units(down)
     assert "give -accel" in caplog.text
+
+
+RAW = np.array([0.09, -0.02, 0.01])
+"""Bias of an iPhone 5 [rad/s]."""
+
+
+def raw_walk(carry: str) -> ImuSequence:
+    return walked(3, 30.0, imu_seed=3, carry=carry, mount_rotvec=(0.4, -0.7, 1.1)).without_truth()
+
+
+@pytest.mark.parametrize("carry", ["handheld", "pocket"])
+@pytest.mark.parametrize(
+    ("axes", "named"), [("yzx", "z, x, y"), ("xyZ", "x, y, -z"), ("Xyz", "-x, y, z")]
+)
+def test_other_axes_and_signs_are_refused_and_the_right_ones_named(carry, axes, named):
+    carried = raw_walk(carry)
+    columns = ["xyz".index(name.lower()) for name in axes]
+    signs = [-1.0 if name.isupper() else 1.0 for name in axes]
+    turned = replace(carried, gyro=carried.gyro[:, columns] * signs)
+    with pytest.raises(InputError, match=f"gyroscope: .* its {named}$"):
+        check_units(turned)
+    check_units(turned.slice(0.0, 5.0))  # so little of a good walk may seem to be wrong as well
+    (told,) = [found for found in inspect_recording(turned).findings if found.code == "refused"]
+    assert f"its {named}" in told.advice
+
+
+@pytest.mark.parametrize("carry", ["handheld", "pocket", "swinging", "trolley"])
+def test_a_raw_bias_is_no_wrong_axis(carry):
+    carried = raw_walk(carry)
+    check_units(carried)
+    check_units(replace(carried, gyro=carried.gyro + RAW))
+
+
+def test_a_raw_bias_on_a_table_and_a_ride_are_no_wrong_axis():
+    """About the vertical it would turn gravity least."""
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(2000)
+    noise = 2e-3 * rng.standard_normal((2, 2000, 3))
+    check_units(ImuSequence("table", time, RAW + noise[0], np.array([0.0, 0.0, 9.81]) + noise[1]))
+    # The car accelerates and brakes and turns: no axes of the gyroscope explain the force.
+    time = 0.01 * np.arange(6000)
+    noise = 0.01 * np.random.default_rng(0).standard_normal((2, 6000, 3))
+    along, turn = 1.5 * np.sin(0.9 * time), 0.3 * np.sin(0.5 * time + 1.0)
+    accel = np.column_stack([along, 8.0 * turn, np.full(6000, 9.81)])
+    gyro = np.outer(turn, [0.0, 0.0, 1.0])
+    check_units(ImuSequence("ride", time, gyro + noise[0], accel + 5.0 * noise[1]))

@@ -1,5 +1,3 @@
-"""The assessment of a magnetometer recovers what was simulated."""
-
 import math
 from dataclasses import replace
 from functools import cache

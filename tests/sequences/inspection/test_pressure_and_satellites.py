@@ -1,5 +1,3 @@
-"""Inspection of barometer and satellite positions."""
-
 from dataclasses import replace
 
 import numpy as np

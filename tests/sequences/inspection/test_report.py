@@ -7,12 +7,12 @@ import pytest
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 from told import told
+from walked import walked
 
 from stario.sequences import (
     InputError,
     inspect_recording,
     read_recording,
-    simulate_imu,
     truth_findings,
 )
 from stario.sequences.drawing.plots import imu_overview
@@ -26,13 +26,11 @@ from stario.sequences.sequence import (
     PositionTrack,
     Satellites,
 )
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 
 @pytest.fixture(scope="module")
 def walk():
-    level = WalkStyle(mount_rotvec=(0.0, 0.0, 0.0))
-    return simulate_imu(generate_walk(8, 30.0, style=level), 100.0, seed=2, name="walk")
+    return walked(8, 30.0, imu_seed=2, mount_rotvec=(0.0, 0.0, 0.0))
 
 
 def problem(sequence: ImuSequence) -> str:

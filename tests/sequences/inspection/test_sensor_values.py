@@ -1,5 +1,3 @@
-"""Values that never change, are stuck, at their limit or wild: refused, named or tolerated."""
-
 import warnings
 from dataclasses import replace
 
@@ -7,8 +5,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
+from walked import walked
 
-from stario.sequences import PHONE_IMU, WalkStyle, check_units, generate_walk, simulate_imu
+from stario.sequences import check_units
 from stario.sequences.inspection.samples import dead_axes, sample_findings, stuck_findings
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
@@ -56,8 +55,7 @@ def test_a_sensor_stuck_for_seconds_is_named(walk, sensor):
 
 
 def test_a_sensor_at_its_limit_is_named_with_the_share_of_samples():
-    style = WalkStyle(carry="swinging", preferred_speed=1.6)
-    free = simulate_imu(generate_walk(5, 30.0, style=style), 100.0, PHONE_IMU, 5).without_truth()
+    free = walked(5, 30.0, imu_seed=5, carry="swinging", preferred_speed=1.6).without_truth()
     limits = {"gyro": 3.5, "accel": 16.0}
     for sensor, limit in limits.items():
         values = getattr(free, sensor)
@@ -101,10 +99,7 @@ def test_a_saturated_accelerometer_is_named_before_its_unit_is_judged(caplog, no
 @pytest.fixture(scope="module")
 def mounted():
     """A walk of a device whose every axis moves, without truth."""
-    style = WalkStyle(mount_rotvec=(0.4, -0.7, 1.1))
-    return simulate_imu(
-        generate_walk(8, 20.0, style=style), 100.0, seed=2, name="w"
-    ).without_truth()
+    return walked(8, 20.0, imu_seed=2, mount_rotvec=(0.4, -0.7, 1.1)).without_truth()
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])

@@ -12,7 +12,6 @@ UP_B = np.array([0.6, 0.0, 0.8])
 
 
 def device_at_rest(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
-    """A tilted device lying still."""
     rng = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     gyro = BIAS + NOISE.gyro_noise * np.sqrt(rate) * rng.normal(size=(len(time), 3))

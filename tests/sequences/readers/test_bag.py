@@ -1,5 +1,3 @@
-"""Bags: types of messages, several topics, sensors that were already corrected."""
-
 import dataclasses
 
 import numpy as np

@@ -31,12 +31,8 @@ def case(name: str) -> Path:
         ("uzh_fpv_imu_txt/imu.txt", 15.0, 100.0),
         ("euroc_float_seconds", 15.0, 100.0),
         ("realsense_split_topics/realsense_split.bag", 60.0, 100.0),
-        ("zeros_of_other_sensor/zr300_like.csv", 15.0, 100.0),
-        ("zeros_of_other_sensor/accel_333_gyro_100.csv", 15.0, 100.0),
         ("crash_ten_minutes/first_three_samples_lost_30s.csv", 30.0, 100.0),
         ("compare_pdr_positions/walk.csv", None, None),
-        ("xsens_utc_columns/MT_01.txt", 15.0, 100.0),
-        ("one_sensor_per_file_and_time_csv", 15.0, 100.0),
     ],
 )
 def test_a_layout_is_read_at_its_rate(name, seconds, rate):
@@ -54,8 +50,6 @@ def test_a_layout_is_read_at_its_rate(name, seconds, rate):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("crash_first_row_short/first_row_cut.csv", "line 2: found 6 values"),
-        ("crash_first_row_short/middle_row_cut.csv", "line 302: found 6 values"),
         ("rostopic_echo_text/echo.txt", "rostopic echo -p"),
         ("rostopic_echo_text", "rostopic echo -p"),
         ("folder_of_CalInertialAndMag/walk_CalInertialAndMag.csv", "--rate"),

@@ -1,5 +1,3 @@
-"""Beside the IMU in a generic CSV: positions, their accuracy, pressure and satellites."""
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -133,7 +131,6 @@ def test_what_is_written_is_read_back(tmp_path_factory, parts):
 
 
 def file_of(folder: Path, titles: str, cells: str) -> Path:
-    """Write 20 samples with further columns."""
     rows = [f"{0.01 * k:.2f},{ROW},{cells}" for k in range(20)]
     return write_lines(folder / "walk.csv", f"t,gx,gy,gz,ax,ay,az{titles}", *rows)
 

@@ -1,5 +1,3 @@
-"""Times as loggers write them for people: dates with zones, times of day, midnight in between."""
-
 from datetime import datetime, timedelta
 from pathlib import Path
 

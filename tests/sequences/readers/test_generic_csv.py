@@ -40,21 +40,6 @@ def test_time_is_read_exactly_from_any_epoch(tmp_path, unit, per_second):
     assert read.time.tolist() == [step / 1e9 for step in steps.tolist()]
 
 
-@pytest.mark.parametrize("first", [0, 1])
-def test_a_count_of_rows_is_no_time_unless_it_has_a_unit(tmp_path, first, caplog):
-    def read(header, step):
-        rows = [f"{first + step * k},{ROW}" for k in range(20)]
-        return read_generic_csv(write_lines(tmp_path / "own.csv", header, *rows))
-
-    header = "time,gx,gy,gz,ax,ay,az"
-    with pytest.raises(ReadError, match=r"time: found .*, which counts the rows.*`time \[ms\]`"):
-        read(header, 1)
-    assert read(header.replace("time", "time [ms]"), 1).rate == pytest.approx(1000.0)
-    with caplog.at_level(logging.INFO):
-        assert read(header, 10).rate == pytest.approx(100.0)
-    assert "own.csv: its times name no unit, their rate fits ms" in caplog.text
-
-
 def test_slower_truth_has_only_its_own_rows_and_an_outlying_time_loses_no_other(tmp_path):
     rows = [
         f"{0.01 * k},{ROW}," + (f"{k},0,1,0,0,0,1" if k % 5 == 0 else ",,,,,,") for k in range(21)

@@ -1,5 +1,3 @@
-"""Folders that lack a part of their recording: the error names the part and its fault."""
-
 import os
 from dataclasses import replace
 
@@ -66,14 +64,6 @@ def test_a_sensor_file_without_permission_is_named(walk, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: path != gyro and allowed(path, mode))
     with pytest.raises(ReadError, match=r"Gyroscope\.csv: path: found no permission to read"):
         read_recording(tmp_path)
-
-
-def test_a_line_of_words_among_rows_is_named_with_the_remedy(walk, tmp_path):
-    imu, *_ = write_euroc(tmp_path / "V1", walk)
-    lines = imu.read_text().splitlines()
-    imu.write_text("\n".join([*lines[:9], "recording paused", *lines[9:]]))
-    with pytest.raises(ReadError, match=r"line 10: .*remove the line"):
-        read_recording(tmp_path / "V1")
 
 
 def test_poses_out_of_order_are_counted(walk, tmp_path, caplog):

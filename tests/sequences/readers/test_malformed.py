@@ -1,5 +1,3 @@
-"""Unreadable files raise a one-line error with file, field, found and expected."""
-
 import json
 import pickle
 import re
@@ -25,10 +23,6 @@ def assert_refused(path: Path, *texts: str) -> None:
     assert re.search(r": found .+, expected .+", line)
     for text in texts:
         assert text in line, line
-
-
-def csv_of(path: Path) -> Path:
-    return next(iter([*path.rglob("data.csv"), *path.rglob("SenseINS.csv")]))
 
 
 def change(path: Path, row: int, column: str, cell: str) -> None:
@@ -100,7 +94,7 @@ def test_an_info_that_is_missing_or_not_json_is_refused(ronin):
 )
 def test_a_damaged_csv_with_named_columns_is_refused(tmp_path, walks, which, quaternion, missing):
     path = getattr(formats, which)(tmp_path / "seq", walks(200.0)).path
-    csv = csv_of(path)
+    csv = next(iter([*path.rglob("data.csv"), *path.rglob("SenseINS.csv")]))
     good = csv.read_text()
     change(csv, 40, "acce_y", "high")
     assert_refused(path, "line 42, acce_y", "found 'high', expected a number")

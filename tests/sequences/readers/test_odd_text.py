@@ -1,5 +1,3 @@
-"""Text as spreadsheets, other languages and killed recorders leave it: read, or refused by name."""
-
 import zipfile
 from pathlib import Path
 

@@ -1,12 +1,12 @@
-"""Tables of text: their heads, ragged rows, rows of one sensor alone, zeros and clocks."""
-
 import numpy as np
 import pytest
+from alike import assert_same_samples
 from csv_lines import write_lines
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from phone_exports import export, save
 
-from stario.sequences import ReadError, read_recording
+from stario.sequences import ReadError, StarioError, read_recording
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.table_head import table_heads
 from stario.sequences.sequence import FloatArray
@@ -180,3 +180,38 @@ def test_zeros_of_the_sensor_that_was_not_read_are_no_samples(tmp_path, rates, p
     assert not (read.gyro == 0.0).all(axis=1).any()
     assert np.median(read.accel[:, 2]) == pytest.approx(9.8, abs=0.2)
     assert read.duration == pytest.approx(SECONDS, abs=0.1)
+
+
+SENSORS = ",".join(f"{sensor}_{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
+
+
+def test_a_cut_row_and_a_file_of_too_few_times_are_named(tmp_path, walk):
+    export("seconds_and_nanoseconds", tmp_path, walk)
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    lines[6] = lines[6].rsplit(",", 4)[0]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(StarioError, match=r"a\.csv: line 7"):
+        read_recording(tmp_path / "a.csv")
+    folder = tmp_path / "few"
+    export("times_in_a_file", folder, walk)
+    save(folder / "time.csv", "time", walk.time[: len(walk) // 2])
+    with pytest.raises(StarioError, match=f"found {len(walk) // 2} and {len(walk)} rows"):
+        read_recording(folder)
+
+
+def test_a_table_without_times_is_read_at_the_rate_given(tmp_path, walk):
+    columns = np.arange(len(walk)), walk.gyro, walk.accel
+    path, timed, counted = (tmp_path / f"{name}.csv" for name in ("a", "b", "MT"))
+    wide = ",".join(f"{name}_{axis}" for name in ("Gyr", "Acc") for axis in "XYZ")
+    save(path, f"count,{SENSORS}", *columns)
+    save(timed, f"time [s],{SENSORS}", *columns)
+    save(counted, f"// Update Rate: 100.0Hz\nPacketCounter,{wide}", *columns)
+    assert_same_samples(read_recording(path, rate="200"), walk)
+    for file, options, message in (
+        (path, {}, "--rate"),
+        (counted, {}, r"MT\.csv: time: .*`t \[s\]`"),
+        (path, {"rate": "0"}, "samples per second"),
+        (timed, {"rate": "200"}, r"the column time \[s\]"),
+    ):
+        with pytest.raises(StarioError, match=message):
+            read_recording(file, **options)

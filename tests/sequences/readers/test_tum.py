@@ -1,5 +1,3 @@
-"""Tracks in TUM format are read back as written; a bad line is named."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,6 +1,3 @@
-"""What a format leaves open: attitude sources, quaternion orders, frames, topics, clocks."""
-
-import json
 import sys
 
 import numpy as np
@@ -94,13 +91,3 @@ def test_a_missing_package_is_named_with_what_installs_it(tmp_path, walks, monke
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match=r"h5py: found not installed.*pip install 'h5py"):
         read_recording(recording.path)
-
-
-def test_calibration_is_applied_as_in_the_authors_filter(tmp_path, walks):
-    recording = formats.tlio_raw(tmp_path / "7", walks(1000.0))
-    calibration = recording.path.with_name("calibration.json")
-    fields = json.loads(calibration.read_text())
-    fields["Accelerometer"]["Bias"]["Offset"] = [0.0, 0.0, 0.0]
-    calibration.write_text(json.dumps(fields))
-    off = read_recording(recording.path).accel - recording.expected.accel
-    assert np.abs(off - [0.1, 0.05, -0.2]).max() < 1e-9  # R^-1 x - b: the bias, not R^-1 b

@@ -1,5 +1,3 @@
-"""Virtual devices on motion capture: a walker made of arithmetic, as HDF5 and as BVH."""
-
 from pathlib import Path
 
 import h5py

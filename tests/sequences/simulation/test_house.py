@@ -1,5 +1,3 @@
-"""Simulated walks through a house: floors, pressure and satellites."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,5 +1,3 @@
-"""A moment is inserted into a recording so that its samples agree with the extended truth."""
-
 from dataclasses import replace
 
 import numpy as np

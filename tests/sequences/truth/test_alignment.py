@@ -1,12 +1,11 @@
-"""Lag, clock offset, mount and axes between a tracked body and its IMU."""
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from walked import walked
 
-from stario.sequences import InputError, WalkStyle, generate_walk
+from stario.sequences import InputError
 from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.alignment import align_tracked_body, clock_offset
 from stario.sequences.attitude.mounts import heading_turn
@@ -14,15 +13,14 @@ from stario.sequences.attitude.rotations import cumulative_rotations
 from stario.sequences.conventions import axes_matrix
 from stario.sequences.readers.poses import accel_axes
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
-from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
+from stario.sequences.simulation.imu import PERFECT_IMU
 
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 LEVER_B = np.array([0.02, -0.1, 0.01])
 
 
 def recorded(carry: str, seconds: float = 120.0) -> tuple[ImuSequence, Trajectory]:
-    style = WalkStyle(carry=carry, preferred_speed=0.8, mount_rotvec=(0.0, 0.0, 0.0))
-    imu = simulate_imu(generate_walk(3, seconds, style=style), 100.0, PHONE_IMU)
+    imu = walked(3, seconds, carry=carry, preferred_speed=0.8, mount_rotvec=(0.0, 0.0, 0.0))
     return imu, imu.truth
 
 
@@ -59,13 +57,16 @@ def test_the_clock_offset_is_found(ahead):
     assert offset == pytest.approx(-ahead, abs=0.05)
 
 
+def aligned(imu, time, attitude_WV, position=None, valid=None):
+    valid = np.ones(len(time), dtype=np.bool_) if valid is None else valid
+    return align_tracked_body(imu.time, imu.gyro, imu.accel, time, attitude_WV, valid, position)
+
+
 def mount_errors(carry: str, noise_rad: float) -> list[float]:
     """Errors [deg] of the mount estimated from the gyroscope alone and from both sensors."""
     imu, truth = recorded(carry)
     position, attitude_WV = captured(truth, noise_rad)
-    valid = np.ones(len(truth), dtype=np.bool_)
-    arguments = (imu.time, imu.gyro, imu.accel, truth.time, attitude_WV, valid)
-    found = align_tracked_body(*arguments), align_tracked_body(*arguments, position)
+    found = [aligned(imu, truth.time, attitude_WV, known) for known in (None, position)]
     return [float(np.degrees((MOUNT_VB.inv() * x.mounts[0][2]).magnitude())) for x in found]
 
 
@@ -81,24 +82,18 @@ def test_on_a_trolley_the_accelerometer_determines_the_mounts_heading():
 def test_the_lag_is_found_to_about_a_millisecond_even_with_little_rotation(late):
     imu, truth = recorded("trolley")
     position, attitude_WV = captured(truth, 0.004)
-    valid = np.ones(len(truth), dtype=np.bool_)
-    aligned = align_tracked_body(
-        imu.time, imu.gyro, imu.accel, truth.time - late, attitude_WV, valid, position
-    )
-    assert aligned.lag == pytest.approx(late, abs=0.0011)
-    assert aligned.correlation > 0.9
+    found = aligned(imu, truth.time - late, attitude_WV, position)
+    assert found.lag == pytest.approx(late, abs=0.0011)
+    assert found.correlation > 0.9
 
 
 def test_a_capture_that_wrote_no_rows_for_a_while_keeps_its_mount():
     imu, truth = recorded("handheld", 60.0)
     _, attitude_WV = captured(truth, 0.004)
     kept = (truth.time < 25.0) | (truth.time > 27.0)
-    valid = np.ones(int(kept.sum()), dtype=np.bool_)
-    aligned = align_tracked_body(
-        imu.time, imu.gyro, imu.accel, truth.time[kept], attitude_WV[kept], valid
-    )
-    assert len(aligned.mounts) == 1
-    assert np.degrees((MOUNT_VB.inv() * aligned.mounts[0][2]).magnitude()) < 1.0
+    found = aligned(imu, truth.time[kept], attitude_WV[kept])
+    assert len(found.mounts) == 1
+    assert np.degrees((MOUNT_VB.inv() * found.mounts[0][2]).magnitude()) < 1.0
 
 
 @pytest.mark.parametrize("error_deg", [-6.0, 4.0])
@@ -129,12 +124,9 @@ def test_single_frames_rotated_about_any_axis_are_masked():
     turns = np.deg2rad(15.0) * axes / np.linalg.norm(axes, axis=1, keepdims=True)
     quat = attitude_WV.as_quat()
     quat[struck] = (attitude_WV[struck] * Rotation.from_rotvec(turns)).as_quat()
-    valid = np.ones(len(truth), dtype=np.bool_)
-    aligned = align_tracked_body(
-        imu.time, imu.gyro, imu.accel, truth.time, Rotation.from_quat(quat), valid
-    )
-    assert not aligned.valid[struck].any()
-    assert aligned.valid.mean() > 0.99
+    found = aligned(imu, truth.time, Rotation.from_quat(quat))
+    assert not found.valid[struck].any()
+    assert found.valid.mean() > 0.99
 
 
 @pytest.mark.parametrize(
@@ -151,33 +143,30 @@ def test_rotation_during_an_imu_gap_is_not_a_flip(gap, flips):
         attitude_WV = Rotation.from_quat(quat)
     kept = (imu.time < gap[0]) | (imu.time > gap[1])
     seen = (truth.time < gap[0]) | (truth.time > gap[1])
-    aligned = align_tracked_body(
-        imu.time[kept], imu.gyro[kept], imu.accel[kept], truth.time, attitude_WV, seen
-    )
-    assert len(aligned.mounts) == 2 + flips
-    error = (truth.attitude_WB.inv() * aligned.attitude_WB)[seen].magnitude()
+    found = aligned(imu.select(kept), truth.time, attitude_WV, valid=seen)
+    assert len(found.mounts) == 2 + flips
+    error = (truth.attitude_WB.inv() * found.attitude_WB)[seen].magnitude()
     assert np.degrees(np.median(error[truth.time[seen] > gap[1]])) < 1.5
     assert np.degrees(np.median(error[truth.time[seen] < gap[0]])) < 1.5
-    assert aligned.correlation > 0.95
+    assert found.correlation > 0.95
 
 
 def test_what_cannot_be_aligned_is_refused():
     """Hardly too short, without gravity, or with a clock whose span would not fit in memory."""
     imu, truth = recorded("handheld", 12.0)
     attitude, valid = truth.attitude_WB, np.ones(len(truth), dtype=np.bool_)
-    short, dead = imu.slice(0.0, 9.995), np.zeros_like(imu.accel)
+    dead = replace(imu, accel=np.zeros_like(imu.accel))
     with pytest.raises(InputError, match=r"found 9\.99 s, expected at least 10 s"):
-        align_tracked_body(short.time, short.gyro, short.accel, truth.time, attitude, valid)
+        aligned(imu.slice(0.0, 9.995), truth.time, attitude)
     with pytest.raises(InputError, match="gravity"):
-        align_tracked_body(imu.time, imu.gyro, dead, truth.time, attitude, valid)
+        aligned(dead, truth.time, attitude)
     with pytest.raises(InputError, match="clock"):
         clock_offset(imu.time, imu.gyro, np.append(0.0, truth.time[1:] + 1.7e9), attitude, valid)
 
 
 @pytest.fixture(scope="module")
 def walk():
-    style = WalkStyle(mount_rotvec=(0.3, -0.2, 0.9))
-    return simulate_imu(generate_walk(2, 20.0, style=style), 100.0, PERFECT_IMU)
+    return walked(2, 20.0, PERFECT_IMU, mount_rotvec=(0.3, -0.2, 0.9))
 
 
 @pytest.mark.parametrize("axes", ["z,x,y", "x,-z,y", "-z,-y,-x"])

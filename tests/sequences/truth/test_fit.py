@@ -1,5 +1,3 @@
-"""The truth fitted to the gyroscope: clock, axes, tilt, scale and bias."""
-
 import re
 from dataclasses import replace
 
@@ -7,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from told import told
+from walked import walked
 
 from stario.sequences import ImuSequence, Trajectory, WalkStyle, generate_walk, inspect_recording
 from stario.sequences.clean_samples import middle_part
@@ -99,8 +98,7 @@ def test_a_truth_that_may_be_of_another_walk_gives_neither_offset_nor_axes(walk,
 
 @pytest.mark.parametrize("signs", [(-1.0, -1.0, -1.0), (1.0, 1.0, -1.0)])
 def test_wrong_gyroscope_signs_are_not_blamed_on_the_truth(signs):
-    style = WalkStyle(carry="pocket", mount_rotvec=(0.0, 0.0, 0.0))
-    walk = simulate_imu(generate_walk(8, 40.0, style=style), 100.0, seed=2)
+    walk = walked(8, 40.0, imu_seed=2, carry="pocket", mount_rotvec=(0.0, 0.0, 0.0))
     (problem,) = fit_findings(fit_truth(replace(walk, gyro=walk.gyro * signs)), "")
     assert "gyroscope" in str(problem)
     assert "sign" in problem.advice
@@ -173,8 +171,7 @@ def test_a_gap_is_no_jump(walk):
 
 @pytest.fixture(scope="module")
 def turning():
-    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
-    return simulate_imu(generate_walk(5, 90.0, style=style), 100.0, PERFECT_IMU, 1)
+    return walked(5, 90.0, PERFECT_IMU, 1, carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
 
 
 @pytest.mark.parametrize(("scale", "bias"), [(0.0, 0.004), (0.023, 0.0), (-0.015, 0.004)])

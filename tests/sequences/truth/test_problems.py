@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from told import told
+from walked import walked
 
 from stario.sequences import PHONE_IMU, InputError, inspect_recording, simulate_imu
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.carrying import CARRYING_MODES
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.positions import fit_positions
 from stario.sequences.truth.problems import (
     check_truth,
@@ -24,8 +24,7 @@ LATE_S = 20.0
 @pytest.fixture(scope="module")
 def walk():
     """A walk whose truth is noisy and slow, as a phone's visual odometry."""
-    walk = generate_walk(8, 40.0, style=WalkStyle(mount_rotvec=(0.0, 0.0, 0.0)))
-    walk = simulate_imu(walk, 100.0, PHONE_IMU, 2, name="w")
+    walk = walked(8, 40.0, imu_seed=2, name="w", mount_rotvec=(0.0, 0.0, 0.0))
     truth = walk.truth.at(np.arange(0.0, 40.0, 0.05))
     noise = 0.005 * np.random.default_rng(0).normal(size=(len(truth), 3))
     return replace(walk, truth=replace(truth, position_W=truth.position_W + noise))
@@ -74,8 +73,7 @@ def test_wrong_positions_are_named_with_the_remedy(walk, found):
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
 def test_right_positions_raise_nothing_however_the_device_is_carried(carry):
-    style = WalkStyle(carry=carry)
-    walk = simulate_imu(generate_walk(3, 40.0, style=style), 100.0, PHONE_IMU, 3)
+    walk = walked(3, 40.0, imu_seed=3, carry=carry)
     kept = (walk.time % 12.0) > 0.5  # the mount needs 10 s without a gap
     gappy = walk.select(kept)
     slow = replace(walk, truth=walk.truth.at(np.arange(0.0, 40.0, 0.1)))
@@ -137,8 +135,7 @@ def test_the_comparison_is_part_of_the_findings(walk):
 @pytest.mark.parametrize("of", ["imu", "truth"])
 def test_positions_are_not_compared_across_gaps(of):
     # Level: the bias of an upright phone's accelerometer turns with the walk.
-    style = WalkStyle(mount_rotvec=(0.0, 0.0, 0.0))
-    walk = simulate_imu(generate_walk(3, 60.0, style=style), 100.0, seed=1)
+    walk = walked(3, 60.0, imu_seed=1, mount_rotvec=(0.0, 0.0, 0.0))
     known = walk.time % 3.0 > 0.5
     position = walk.truth.position_W + np.cumsum(~known)[:, None] * [0.01, 0.0, 0.0]  # relocalised
     lost = replace(walk.truth, position_W=position, valid=known)

@@ -65,8 +65,6 @@ class FaultyNetwork:
 
 
 class Stream:
-    """A navigator that is driven through faults, with a check of every state."""
-
     def __init__(self, backend: str) -> None:
         self.model = FaultyNetwork()
         self.backend: Any = backend

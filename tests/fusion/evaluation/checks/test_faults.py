@@ -1,5 +1,3 @@
-"""Faults are reported and cost little."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Checks of recordings by group: fusion and network, fixes, missing samples."""
-
 from dataclasses import replace
 from itertools import count
 
@@ -61,7 +59,6 @@ def test_ratios_of_two_tracks_are_geometric_means_with_their_standard_error():
 
 
 def test_time_is_per_minute_of_data(monkeypatch):
-    """With a clock that advances by a second on every reading."""
     clock = count()
     monkeypatch.setattr(fusion, "process_time", lambda: float(next(clock)))
     found = simulated_gain(0, 10.0, graph=True)
@@ -185,7 +182,6 @@ def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(walk
 
 
 def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees(still_model, walk, monkeypatch):
-    """Three ends: the unmodified one, one 0.5 m and 20 degrees off, the others not at all."""
     time, position = np.arange(3.0), np.outer(np.arange(3.0), [5.0, 0.0, 0.0])
     turned = about_z(np.radians([0.0, 10.0, -20.0]))
     straight = Track(Trajectory(time, position, about_z(np.zeros(3))))

@@ -1,5 +1,3 @@
-"""Bad moments and simulated walks: what is measured, and the tables."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -129,7 +127,6 @@ def test_simulated_walks_move_about_as_recorded_ones(carry):
 
 
 def test_motion_is_that_of_a_known_vibration():
-    """A device that shakes along the vertical at 4.5 Hz, steps at 2 Hz and turns evenly."""
     time = np.arange(0.0, 20.0, 0.01)
     accel = np.zeros((len(time), 3))
     accel[:, 2] = 9.8 + 2.0 * np.sin(2.0 * np.pi * 2.0 * time) + np.sin(2.0 * np.pi * 4.5 * time)

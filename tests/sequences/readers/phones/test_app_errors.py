@@ -1,5 +1,3 @@
-"""Files and zips that no reader of phone apps takes are refused in one line that names why."""
-
 import zipfile
 
 import numpy as np
@@ -35,15 +33,19 @@ def test_two_recordings_in_a_zip_are_named(walk, tmp_path):
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_a_count_of_rows_is_no_time(first, walk, tmp_path):
-    count = first + np.arange(len(walk))
+def test_a_count_of_rows_is_no_time_unless_it_has_a_unit(first, walk, tmp_path):
+    count, own = first + np.arange(len(walk)), "time,gx,gy,gz,ax,ay,az"
+    save(tmp_path / "own.csv", own, count, walk.gyro, walk.accel)
+    save(tmp_path / "ms.csv", own.replace("time", "time [ms]"), count, walk.gyro, walk.accel)
+    assert read_recording(tmp_path / "ms.csv").rate == pytest.approx(1000.0)
     wide = ",".join(f"{name} {axis}" for name in ("Gyroscope", "Accelerometer") for axis in "XYZ")
     save(tmp_path / "wide.csv", f"timestamp,{wide}", count, walk.gyro, walk.accel)
     for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
         save(tmp_path / f"titled/{name}.csv", "time,x,y,z", count, values)
         save(tmp_path / f"bare/{name}.csv", "", count, values)
-    for name, title in (("wide.csv", "timestamp"), ("titled", "time"), ("bare", "time")):
-        with pytest.raises(ReadError, match=rf"{title}: found {first}, .* counts the rows"):
+    for name in ("own.csv", "wide.csv", "titled", "bare"):
+        title = "timestamp" if name == "wide.csv" else "time"
+        with pytest.raises(ReadError, match=rf"{title}: found {first}, .* counts the rows.*\[ms\]"):
             read_recording(tmp_path / name)
 
 

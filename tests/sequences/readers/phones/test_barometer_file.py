@@ -1,5 +1,3 @@
-"""Pressure next to the sensors of a phone's recording, and in lines of events."""
-
 import re
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""One table with all sensors: titles as people write them, several IMUs, rows by sensor."""
-
 import logging
 from pathlib import Path
 
@@ -9,7 +7,7 @@ from alike import assert_same_samples
 from csv_lines import write_lines
 from phone_exports import Walk, export, write
 
-from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
+from stario.sequences import ImuSequence, ReadError, read_recording
 
 TABLES = {
     # A unit within the name.
@@ -111,14 +109,6 @@ def rows_of(walk: ImuSequence, folder: Path) -> tuple[str, list[str]]:
     export("rows_by_sensor", folder, walk)
     titles, *rows = (folder / "own.csv").read_text().splitlines()
     return titles, rows
-
-
-def test_a_table_of_rows_by_sensor_is_one_recording(walk, tmp_path):
-    rows_of(walk, tmp_path)
-    assert find_recordings(tmp_path) == [tmp_path / "own.csv"]
-    read = read_recording(tmp_path / "own.csv")
-    assert read.name == "own"
-    assert "the sensor named in each row" in read.summary()
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,18 @@ from alike import assert_same_samples, assert_upright
 from phone_exports import EXPORTS, Y_UP, ZYX, export, field, gravity, ns, save
 from recorded import DATA
 from scipy.spatial.transform import Rotation
+from walked import walked
 
-from stario.sequences import ReadError, WalkStyle, find_recordings, generate_walk, read_recording
+from stario.sequences import (
+    InputError,
+    ReadError,
+    check_units,
+    find_recordings,
+    read_recording,
+    with_conventions,
+)
 from stario.sequences.conventions import with_axes, with_gravity
-from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.imu import PERFECT_IMU
 
 RAW = DATA / "raw"
 
@@ -28,13 +36,6 @@ def test_an_apps_export_is_read_as_the_walk(app, walk, tmp_path):
     if with_field:
         np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-8)
         np.testing.assert_allclose(read.magnetometer.time, walk.time, atol=1e-3)
-
-
-def test_old_unit_symbols_are_read(walk, tmp_path):
-    export("androsensor", tmp_path / "s", walk)
-    (path,) = (tmp_path / "s").iterdir()
-    path.write_bytes(path.read_text().replace("μ", "µ").encode("latin-1"))
-    np.testing.assert_allclose(read_recording(path).accel, walk.accel)
 
 
 def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(walk, tmp_path):
@@ -158,8 +159,7 @@ def test_a_missing_sensor_is_named(walk, tmp_path):
 
 
 def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(tmp_path, caplog):
-    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
-    walk = simulate_imu(generate_walk(3, 60.0, style=style), 50.0, PERFECT_IMU)
+    walk = walked(3, 60.0, PERFECT_IMU, rate=50.0, carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
     poses = np.hstack(
         [Y_UP.apply(walk.truth.position_W), (Y_UP * walk.truth.attitude_WB).as_quat()]
     )
@@ -206,3 +206,63 @@ def test_the_apps_own_files_contain_gravity_and_the_expected_truth(name):
     assert (read.device_attitude is not None) == any(part in name for part in logged)
     if read.truth is not None:
         assert_upright(read, 3.0)
+
+
+def test_the_summary_names_the_unit_that_times_were_taken_for(walk, tmp_path):
+    """Not if the file names it, or if the times are counted from 1970 and fit no other."""
+    wide = ",".join(f"{name} {axis}" for name in ("Gyro", "Acc") for axis in "XYZ")
+    generic = "gx,gy,gz,ax,ay,az"
+    millis = 10 * np.arange(len(walk)) + 7
+    for titles, times, words in (
+        (f"time,{wide}", millis, ", times taken as ms, 15.0 s"),
+        (f"time,{generic}", millis, ", times taken as ms, 15.0 s"),
+        (f"time,{generic}", walk.time, ", times taken as s, 15.0 s"),
+        (f"time (ms),{wide}", millis, "file, 15.0 s"),
+        (f"time [ms],{generic}", millis, "CSV, 15.0 s"),
+        (f"time,{wide}", ns(walk), "file, 15.0 s"),
+        (f"time,{generic}", ns(walk), "CSV, 15.0 s"),
+    ):
+        save(tmp_path / "a.csv", titles, times, walk.gyro, walk.accel)
+        assert words in read_recording(tmp_path / "a.csv").summary()
+    export("ios_logger", tmp_path / "b", walk)
+    for words in ("b: iOS Logger, 15.0 s at 100.0 Hz, magnetometer at 100 Hz", "own attitude"):
+        assert words in read_recording(tmp_path / "b").summary()
+
+
+def test_an_undetermined_accelerometer_sign_is_reported(walk, tmp_path, caplog):
+    export("sensor_logger_ios", tmp_path / "s", walk)
+    (tmp_path / "s/Metadata.csv").unlink()
+    undetermined = read_recording(tmp_path / "s")
+    for read in (undetermined, with_conventions(undetermined)):
+        check_units(read)
+        assert "from an iPhone, pass `--accel-sign apple`" in caplog.text
+        caplog.clear()
+    turned = with_conventions(undetermined, accel_sign="apple")
+    np.testing.assert_allclose(turned.accel, walk.accel, atol=1e-8)
+    check_units(with_conventions(turned))
+    assert not caplog.text
+    export("ios_logger", tmp_path / "t", walk)
+    for name in ("Motion.txt", "MotMagnFull.txt"):
+        (tmp_path / "t" / name).unlink()
+    with pytest.raises(InputError, match=r"`--accel-unit g`.* `--accel-sign apple`"):
+        check_units(read_recording(tmp_path / "t"))
+    assert not caplog.text
+
+
+def test_lines_of_an_attitude_that_cannot_be_read_cost_no_recording(walk, tmp_path):
+    export("get_sensor_data", tmp_path, walk)
+    path = tmp_path / "log.txt"
+    path.write_text(path.read_text().replace(";1;2;3;", ";1;2;"))
+    assert read_recording(path).device_attitude is None
+
+
+@pytest.mark.parametrize("second_clock", [False, True])
+def test_swapped_rows_at_the_start_of_a_file_without_titles(second_clock, walk, tmp_path):
+    order = np.arange(len(walk))
+    order[[4, 5, 12, 13]] = [5, 4, 13, 12]
+    clocks = [[stamp, stamp] if second_clock else [stamp] for stamp in ns(walk)]
+    for name, values in (("gyro", walk.gyro), ("acce", walk.accel), ("gyro_uncalib", walk.accel)):
+        rows = np.asarray(clocks)[order]
+        save(tmp_path / f"s/{name}.txt", "", rows, values[order], sep=" ")
+    sequence = read_recording(tmp_path / "s")
+    assert_same_samples(sequence.select(np.argsort(sequence.time)), walk)

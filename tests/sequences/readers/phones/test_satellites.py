@@ -1,5 +1,3 @@
-"""Satellite positions next to the sensors of a phone's recording."""
-
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 

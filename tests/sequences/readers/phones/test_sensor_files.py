@@ -1,5 +1,3 @@
-"""One file per sensor: which belong together, their titles, units and clocks."""
-
 from pathlib import Path
 
 import numpy as np
@@ -111,15 +109,6 @@ def test_a_unit_named_by_a_logger_is_used_once_or_refused(walk, tmp_path):
     with_units(named, accel_unit="-m/s^2")
     with pytest.raises(ReadError, match="time: found unit 'ticks', expected s, ms, us, ns"):
         read_recording(tmp_path / "ticks")
-
-
-def test_a_blank_first_row_of_a_sensor_that_starts_late_is_none(walk, tmp_path):
-    for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
-        file = tmp_path / f"{name}.csv"
-        save(file, "time,z,y,x", walk.time, values[:, ::-1])
-        header, first, *rows = file.read_text().splitlines()
-        file.write_text("\n".join([header, f"{first.split(',')[0]},,,", *rows]) + "\n")
-    np.testing.assert_array_equal(read_recording(tmp_path).gyro, walk.gyro[1:])
 
 
 # --- clocks ----------------------------------------------------------------------------------

@@ -1,5 +1,3 @@
-"""OxIOD: rows in step or with clocks of their own, mounted and lagging captures, lost tracking."""
-
 from pathlib import Path
 
 import numpy as np
