@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from recorded import DATA
+from support import stream
 
 from stario.fusion import Navigator, NavigatorConfig, compare
 from stario.fusion.evaluation.compare import measure
@@ -44,6 +45,17 @@ def test_recordings_of_every_format_run_with_a_bounded_error(model, name, worst_
     sigma = np.sqrt(np.diag(track.covariance[-1])[6:9])
     assert (sigma > 0.0).all()
     assert result.metrics["track"]["ate_m"] < worst_m
+
+
+def test_stream_equals_batch_within_a_millimetre(model):
+    recording = stretch(TUMVI, 15.0)
+    track, navigator = Navigator(model, backend="ekf").run(recording), Navigator(model)
+    states = stream(navigator, recording)
+    assert len(states) == len(track.time) - navigator.config.filter.output_rate
+    at = np.searchsorted(track.time, [s.time for s in states])
+    off = track.trajectory.position_W[at] - np.array([s.p_W for s in states])
+    assert np.linalg.norm(off, axis=1).max() < 1e-3
+    assert navigator.health.gated == track.health.gated
 
 
 @pytest.mark.slow
