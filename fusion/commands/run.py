@@ -40,6 +40,7 @@ def run(
     """Fuse each recording into a smooth track with attitude, velocity, biases and covariance."""
     from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
+    from stario.fusion.evaluation.text import track_figures
     from stario.fusion.navigator import Navigator
     from stario.fusion.values.fix_file import check_within, read_fixes
 
@@ -66,7 +67,10 @@ def run(
             from stario.fusion.report.view import open_view
 
             open_view(folder / "track.rrd")
-        record: dict[str, object] = {"recording": sequence.name, **found.metrics}
+        sigma = track.health.final_sigma if track.health else {}
+        summary = {**track_figures(track), "final_sigma": sigma}
+        record: dict[str, object] = {"recording": sequence.name, "summary": summary}
+        record |= found.metrics
         record |= {"verdict": [asdict(f) for f in found.verdict], "folder": str(folder)}
         lines = [*_lines(found), f"{folder}: {', '.join(path.name for path in written)}"]
         return record, "\n".join(lines)

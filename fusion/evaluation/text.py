@@ -24,6 +24,7 @@ from stario.fusion.evaluation.known_positions import position_error_words
 from stario.fusion.evaluation.results import metrics_dict
 from stario.fusion.evaluation.scores import Column, table
 from stario.fusion.report.health import LOST_YAW_SIGMA
+from stario.fusion.values.state import Track
 from stario.sequences.arrays import check_type
 from stario.sequences.drawing.figures import distance
 from stario.sequences.drawing.text_table import aligned, figure
@@ -58,15 +59,23 @@ def track_table(found: Comparison) -> str:
     return "\n".join(aligned([["", *columns.values()], *rows]))
 
 
+def track_figures(track: Track) -> dict[str, float]:
+    """Return a track's duration [s], length [m] and the end's distance from the start [m]."""
+    time, position_W = track.time, track.trajectory.position_W
+    return {
+        "seconds": float(time[-1] - time[0]),
+        "length_m": track.trajectory.path_length(),
+        "end_m": float(np.linalg.norm(np.diff(position_W[[0, -1], :2], axis=0))),
+    }
+
+
 def track_words(found: Comparison) -> str:
     """Return in one line the length of the track, where it ends, and how sure that is."""
-    track, time, recorded = found.track, found.track.time, found.sequence.duration
-    tracked = float(time[-1] - time[0])
+    track, recorded = found.track, found.sequence.duration
+    tracked, length, ends = track_figures(track).values()
     duration = f"{recorded:.1f} s"
     if recorded - tracked >= _UNTRACKED:
         duration = f"{tracked:.1f} of {recorded:.1f} s tracked"
-    ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    length = track.trajectory.path_length()
     words = f"{length:.1f} m in {duration}, ending {ends:.1f} m from its start"
     if sigma := track.health and track.health.final_sigma:
         lost = sigma["yaw_rad"] >= LOST_YAW_SIGMA

@@ -17,7 +17,10 @@ TRACK_LABELS = ("dead reckoning (IMU alone)", "network alone", "StarIO", "truth"
 
 def test_run_writes_a_report_and_the_filters_track(stario, recording, tmp_path, no_figures):
     done = stario("run", recording, "--out", "told", "--report", "--filtered", "--json")
-    assert json.loads(done.out)["filtered"]["ate_m"] > 0.0
+    found = json.loads(done.out)
+    assert found["filtered"]["ate_m"] > 0.0
+    assert found["summary"]["length_m"] > found["summary"]["end_m"] > 0.0
+    assert found["summary"]["final_sigma"]["position_m"] > 0.0
     times = [np.load(tmp_path / "told" / f"{name}.npz")["time"] for name in ("track", "filtered")]
     np.testing.assert_array_equal(*times)
     text = (tmp_path / "told/report.html").read_text()
