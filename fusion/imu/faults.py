@@ -14,13 +14,13 @@ From then on it counts as stopped until its values change. Samples of a stopped 
 so that they are treated as a gap. A sensor whose values have never changed is dead (`units`). Three
 zeros of an accelerometer are no measurement at all, not even of a free fall, which has noise.
 
-Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values of a moving
-axis that repeat exactly and more than once at the largest magnitude measured so far; two that are
-equal by chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so
-these are only flagged. A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its
-accelerometer measures 8 or 16: the force that it misses is of its limit's size. What recurs, as in
-a runner's pocket with a limit of 2 g, the filter learns from its innovations; what happens once
-must be said at once.
+Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values that repeat
+exactly and more than once at the largest magnitude measured so far, beside steps that are too large
+for a peak rounded to coarse digits; two that are equal by chance, at a magnitude soon exceeded, do
+not count. What the sensor missed is unknown, so these are only flagged. A phone that falls 1 m
+stops within 10 to 20 ms at 30 to 60 g, of which its accelerometer measures 8 or 16: the force that
+it misses is of its limit's size. What recurs, as in a runner's pocket with a limit of 2 g, the
+filter learns from its innovations; what happens once must be said at once.
 """
 
 from __future__ import annotations
@@ -205,9 +205,10 @@ class _Repetition:
             self.stopped = moves(table[:, 0], table[:, 1:4], table[:, 4:7])
 
 
-_MOVING_RANGE = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
-_LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
-"""An axis within this range and size [rad/s], [m/s^2] may repeat itself: coarse digits at rest."""
+_ROUNDED_STEP = np.array([0.1, 0.1, 0.1, 0.75, 0.75, 0.75])
+"""Largest step [rad/s], [m/s^2] beside a peak that is rounded to equal values, five digits: n of
+them lie on a parabola that falls by 4 / n digits in the next step; rounding adds one, noise two.
+The coarsest digits are a degree per second, and 8 bits of 2 g."""
 
 _MIN_REPEATS = 2.0
 """Minimum number of repetitions at the same limit that cannot be chance."""
@@ -267,9 +268,9 @@ class OutlierDetector:
 
     def _count_saturated(self, values: FloatArray) -> FloatArray:
         """Return the number of samples per axis (6,) that repeat at the axis's limit."""
-        size = np.abs(values)
-        moving = (np.ptp(values, axis=0) > _MOVING_RANGE) | (self.largest > _LARGE_VALUE)
-        repeated: BoolArray = (values[1:] == values[:-1]) & (size[1:] >= self.largest) & moving
-        count = repeated.sum(axis=0)
-        self._repeats = self._repeats + count
+        largest: BoolArray = np.abs(values) >= self.largest
+        steps = np.abs(values[1:] - values[:-1])
+        count = ((steps == 0.0) & largest[1:]).sum(axis=0)
+        beside = np.where(largest[1:] | largest[:-1], steps, 0.0).max(axis=0)
+        self._repeats = self._repeats + np.where(beside > _ROUNDED_STEP, count, 0)
         return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))

@@ -39,6 +39,14 @@ def test_coarse_values_that_repeat_while_rising_are_not_saturated():
     assert count_saturated(rising) == 0
 
 
+def test_peaks_rounded_to_coarse_digits_are_not_saturated(walk, still_model):
+    """Of 8 bits of 2 g, and of a degree per second."""
+    digits = {"gyro": 0.02, "accel": 0.15}
+    coarse = {name: digit * np.round(getattr(walk, name) / digit) for name, digit in digits.items()}
+    health = Navigator(still_model, backend="ekf").run(replace(walk, **coarse)).health
+    assert health.flagged["saturated"] == 0
+
+
 def test_a_clipped_sine_is_saturated_at_its_limit():
     clipped = np.clip(8.0 * np.sin(np.arange(0.0, 40.0, 0.05)), -5.0, 5.0)
     stuck = int(((clipped[1:] == clipped[:-1]) & (np.abs(clipped[1:]) == 5.0)).sum())
