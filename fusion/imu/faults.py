@@ -9,10 +9,13 @@ Stopped sensors: no real sensor repeats its numbers for long, since noise change
 Six numbers that repeat for a tenth of a second come from sensors that have stopped, unless the
 device may be at rest. One sensor alone: loggers repeat samples of a slow one, and a coarse one at
 rest measures the same numbers for minutes. So its values must repeat for half a second in which the
-other one shows motion that they rule out, by the rules of `sequences.inspection.samples`.
-From then on it counts as stopped until its values change. Samples of a stopped sensor are dropped,
-so that they are treated as a gap. A sensor whose values have never changed is dead (`units`). Three
-zeros of an accelerometer are no measurement at all, not even of a free fall, which has noise.
+other one shows motion that they rule out, by the rules of `sequences.inspection.samples`; or those
+of one axis of the gyroscope, below any limit, while both others vary by more than digits hide. From
+then on it counts as stopped until its values change. Samples of a stopped sensor are dropped, so
+that they are treated as a gap. (An axis of the accelerometer that stops at a usual force costs less
+than the heading that is lost in a gap.) A sensor whose values have never changed is dead (`units`);
+an axis may be constant from the beginning, as in data simulated in a plane. Three zeros of an
+accelerometer are no measurement at all, not even of a free fall, which has noise.
 
 Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values that repeat
 exactly and more than once at the largest magnitude measured so far, beside steps that are too large
@@ -27,6 +30,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
+from operator import ne
 from typing import Literal
 
 import numpy as np
@@ -121,6 +126,27 @@ _ALONE_SAMPLES = round(MIN_RATE * _ALONE_SECONDS)
 """Minimum number of samples in that time: a gap shows no motion."""
 
 
+_TURNS, _LEAST_LIMIT = 0.06, 3.0
+"""Standard deviation of the other two rates [rad/s] above which no digits of a gyroscope hide the
+third one (three of a degree per second), and the least rate that may be its limit [rad/s]."""
+
+
+def _contradicts_constant_rate(
+    axis: int, time: FloatArray, gyro: FloatArray, accel: FloatArray
+) -> bool:
+    """Return whether both other rates vary, as in no rotation with a constant third one."""
+    others = np.delete(gyro, axis, axis=1).std(axis=0)
+    return bool(others.min() > _TURNS and abs(gyro[0, axis]) < _LEAST_LIMIT)
+
+
+_PARTS: list[tuple[Stopped, slice, Moves]] = [
+    ("gyroscope", slice(1, 4), contradicts_constant_gyro),
+    ("accelerometer", slice(4, 7), contradicts_constant_accel),
+    *(("gyroscope", slice(k + 1, k + 2), partial(_contradicts_constant_rate, k)) for k in range(3)),
+]
+"""What may stop alone, its columns, and whether others show motion that its values rule out."""
+
+
 class FrozenSensorDetector:
     """Detects sensors that have stopped and repeat their last values.
 
@@ -132,39 +158,37 @@ class FrozenSensorDetector:
         self._gravity = gravity
         self._last: Sample = (math.nan,) * 7  # before the first: no value equals NaN
         self._since = math.inf  # time of the first of equal samples [s]
-        self._unclear = True  # whether a sensor repeats its values, or has never changed them
-        self._gyro, self._accel = _Repetition(), _Repetition()
+        self._unclear = True  # whether a part repeats its values, or has never changed them
+        self._parts = [_Repetition() for _ in _PARTS]
 
     def stopped(self, sample: Sample) -> Stopped | None:
         """Return what has stopped according to a sample (time, gyro, accel); None if nothing."""
         last, self._last = self._last, sample
-        if self._accel.varied and not any(sample[4:]):
+        accel = self._parts[1]
+        if accel.varied and not any(sample[4:]):
             return "accelerometer" if any(sample[1:4]) else "both"
-        # Nearly all samples end here: comparing two numbers is the cheapest proof.
-        if sample[1] != last[1] and sample[4] != last[4] and not self._unclear:
+        # Most samples end here: comparing the numbers is the cheapest proof.
+        if not self._unclear and all(map(ne, sample, last)):
             self._since = sample[0]
             return None
         return self._judged(last, sample)
 
     def _judged(self, last: Sample, sample: Sample) -> Stopped | None:
-        same_gyro, same_accel = sample[1:4] == last[1:4], sample[4:] == last[4:]
-        if not (same_gyro and same_accel):
+        if sample[1:] != last[1:]:
             self._since = math.inf if math.isnan(last[0]) else sample[0]
         elif sample[0] - self._since > _FROZEN_SECONDS and not self._looks_at_rest():
             return "both"
-        gyro, accel = self._gyro, self._accel
-        # Both, whatever the first says: each has to know when its values change.
-        pairs = (
-            (gyro, same_gyro, contradicts_constant_gyro),
-            (accel, same_accel, contradicts_constant_accel),
-        )
-        for sensor, same, moves in pairs:
-            if same:
-                sensor.add(last, sample, moves)
+        self._unclear, found = False, None
+        # All of them, whatever the first says: each has to know when its values change.
+        for part, (sensor, columns, moves) in zip(self._parts, _PARTS, strict=True):
+            if same := sample[columns] == last[columns]:
+                part.add(last, sample, moves)
             else:
-                sensor.restart(last)
-        self._unclear = same_gyro or same_accel or not (gyro.varied and accel.varied)
-        return "gyroscope" if gyro.stopped else "accelerometer" if accel.stopped else None
+                part.restart(last)
+            self._unclear |= same or not part.varied
+            if part.stopped:
+                found = found or sensor
+        return found
 
     def _looks_at_rest(self) -> bool:
         gyro, accel = self._last[1:4], self._last[4:]
@@ -173,25 +197,25 @@ class FrozenSensorDetector:
 
 
 class _Repetition:
-    """Samples in which one sensor repeats its values.
+    """Samples in which a sensor, or one axis of it, repeats its values.
 
     Attributes:
         varied: whether its values have ever changed.
-        stopped: whether the other sensor has shown motion that its values rule out.
+        stopped: whether others have shown motion that its values rule out.
     """
 
     def __init__(self) -> None:
         self.varied = self.stopped = False
-        self._samples: list[Sample] = []  # since the other sensor was last asked
+        self._samples: list[Sample] = []  # since others were last asked
 
     def restart(self, last: Sample) -> None:
-        """Note that the sensor's values differ from those of the sample before, if there is one."""
+        """Note that the values differ from those of the sample before, if there is one."""
         self.varied, self.stopped = not math.isnan(last[0]), False
         if self._samples:
             self._samples = []
 
     def add(self, last: Sample, sample: Sample, moves: Moves) -> None:
-        """Add a sample that repeats the values of the last one; ask the other sensor for motion."""
+        """Add a sample that repeats the values of the last one; ask others for motion."""
         if self.stopped or not self.varied:
             return
         if sample[0] < last[0]:  # a late sample, or the one before was ahead of its time

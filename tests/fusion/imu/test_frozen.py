@@ -64,6 +64,26 @@ def test_one_sensor_that_stops_makes_a_gap_and_is_named(walk, make_oracle, senso
     assert not any("same rate" in line for line in health_lines(track.health))
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_one_axis_of_the_gyroscope_that_stops_is_named(walk, still_model, axis):
+    gyro, dead = walk.gyro.copy(), (walk.time >= 8.0) & (walk.time < 12.0)
+    gyro[dead, axis] = gyro[np.argmax(dead), axis]
+    health = Navigator(still_model, backend="ekf").run(replace(walk, gyro=gyro)).health
+    assert health.stopped == {"gyroscope": pytest.approx(300, abs=60)}
+    ((start, length),) = health.gaps
+    assert start + length == pytest.approx(12.0, abs=0.05)
+
+
+def test_an_axis_may_be_constant_in_a_plane_or_between_coarse_digits(walk):
+    """Also one that is constant from the beginning, and one that reaches its limit."""
+    coarse = 0.02 * np.round(walk.gyro / 0.02), 0.15 * np.round(walk.accel / 0.15)
+    assert frozen_samples(walk.time, *coarse) == 0
+    planar = walk.gyro * [1.0, 1.0, 0.0]
+    assert frozen_samples(walk.time, planar, walk.accel) == 0
+    fast = walk.gyro + [0.0, 0.0, 8.0] * (walk.time[:, None] > 8.0)
+    assert frozen_samples(walk.time, np.minimum(fast, 4.0), walk.accel) == 0
+
+
 @pytest.mark.parametrize("sensor", NAMES)
 def test_a_slow_sensor_may_be_repeated_at_the_rate_of_the_other(walk, still_model, sensor):
     slow = getattr(walk, sensor)[np.arange(len(walk)) // 10 * 10]
