@@ -17,13 +17,13 @@ than the heading that is lost in a gap.) A sensor whose values have never change
 an axis may be constant from the beginning, as in data simulated in a plane. Three zeros of an
 accelerometer are no measurement at all, not even of a free fall, which has noise.
 
-Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values that repeat
-exactly and more than once at the largest magnitude measured so far, beside steps that are too large
-for a peak rounded to coarse digits; two that are equal by chance, at a magnitude soon exceeded, do
-not count. What the sensor missed is unknown, so these are only flagged. A phone that falls 1 m
-stops within 10 to 20 ms at 30 to 60 g, of which its accelerometer measures 8 or 16: the force that
-it misses is of its limit's size. What recurs, as in a runner's pocket with a limit of 2 g, the
-filter learns from its innovations; what happens once must be said at once.
+Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values of a moving
+axis that repeat exactly and more than once at the largest magnitude measured so far, beside steps
+that are too large for a peak rounded to the axis's digits; two that are equal by chance, at a
+magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are only flagged.
+A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its accelerometer measures 8
+or 16: the force that it misses is of its limit's size. What recurs, as in a runner's pocket with a
+limit of 2 g, the filter learns from its innovations; what happens once must be said at once.
 """
 
 from __future__ import annotations
@@ -229,10 +229,17 @@ class _Repetition:
             self.stopped = moves(table[:, 0], table[:, 1:4], table[:, 4:7])
 
 
-_ROUNDED_STEP = np.array([0.1, 0.1, 0.1, 0.75, 0.75, 0.75])
-"""Largest step [rad/s], [m/s^2] beside a peak that is rounded to equal values, five digits: n of
-them lie on a parabola that falls by 4 / n digits in the next step; rounding adds one, noise two.
-The coarsest digits are a degree per second, and 8 bits of 2 g."""
+_MOVING_RANGE = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
+_LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
+"""An axis within this range and size [rad/s], [m/s^2] may repeat itself: coarse digits at rest."""
+
+_COARSEST = np.array([0.02, 0.02, 0.02, 0.15, 0.15, 0.15])
+"""Digit of an axis until a smaller one has shown [rad/s], [m/s^2]: a degree per second, and 8 bits
+of 2 g."""
+
+_ROUNDED_STEP = 5.0
+"""Largest step beside a peak that is rounded to equal values, in digits: n of them lie on a
+parabola that falls by 4 / n digits in the next step; rounding adds one, noise two."""
 
 _MIN_REPEATS = 2.0
 """Minimum number of repetitions at the same limit that cannot be chance."""
@@ -251,6 +258,7 @@ class OutlierDetector:
 
     def __init__(self) -> None:
         self.largest = np.zeros(6)
+        self._digits = _COARSEST  # smallest step of each axis so far
         self._repeats = np.zeros(6)  # of each axis at its current largest magnitude
         self._impacts = 0.0  # recent ones, each weighted by its age
         self._time = -math.inf
@@ -269,7 +277,7 @@ class OutlierDetector:
         self.largest = largest
         saturated = _NO_AXES
         if not steps.all():
-            saturated = self._count_saturated(values)
+            saturated = self._count_saturated(values, np.abs(steps))
         bad = (spikes + saturated) > 0
         if not bad.any():
             return NO_FLAGS
@@ -290,11 +298,17 @@ class OutlierDetector:
         self._impacts, self._time = recent + 1.0, float(time[-1])
         return float((_MISSED * self.largest[3:] * seconds).max() / (1.0 + recent))
 
-    def _count_saturated(self, values: FloatArray) -> FloatArray:
-        """Return the number of samples per axis (6,) that repeat at the axis's limit."""
-        largest: BoolArray = np.abs(values) >= self.largest
-        steps = np.abs(values[1:] - values[:-1])
-        count = ((steps == 0.0) & largest[1:]).sum(axis=0)
-        beside = np.where(largest[1:] | largest[:-1], steps, 0.0).max(axis=0)
-        self._repeats = self._repeats + np.where(beside > _ROUNDED_STEP, count, 0)
+    def _count_saturated(self, values: FloatArray, steps: FloatArray) -> FloatArray:
+        """Return the number of samples per axis (6,) that repeat at the axis's limit.
+
+        The steps (n - 1, 6) are those before spikes were replaced, which digits do not explain; nor
+        those from the first sample, which may be interpolated.
+        """
+        shown = np.where(steps[1:] > 0.0, steps[1:], np.inf).min(axis=0, initial=np.inf)
+        self._digits = np.minimum(self._digits, shown)
+        at_limit: BoolArray = np.abs(values) >= self.largest
+        moving = (np.ptp(values, axis=0) > _MOVING_RANGE) | (self.largest > _LARGE_VALUE)
+        count = ((values[1:] == values[:-1]) & at_limit[1:] & moving).sum(axis=0)
+        beside = np.where(at_limit[1:] | at_limit[:-1], steps, 0.0).max(axis=0)
+        self._repeats = self._repeats + np.where(beside > _ROUNDED_STEP * self._digits, count, 0)
         return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))

@@ -39,9 +39,9 @@ def test_coarse_values_that_repeat_while_rising_are_not_saturated():
     assert count_saturated(rising) == 0
 
 
-def test_peaks_rounded_to_coarse_digits_are_not_saturated(walk, still_model):
+def test_peaks_rounded_to_coarse_digits_are_not_saturated(make_walk, still_model):
     """Of 8 bits of 2 g, and of a degree per second."""
-    digits = {"gyro": 0.02, "accel": 0.15}
+    walk, digits = make_walk(3, 20.0), {"gyro": 0.02, "accel": 0.15}
     coarse = {name: digit * np.round(getattr(walk, name) / digit) for name, digit in digits.items()}
     health = Navigator(still_model, backend="ekf").run(replace(walk, **coarse)).health
     assert health.flagged["saturated"] == 0
