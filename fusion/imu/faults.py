@@ -9,24 +9,29 @@ Stopped sensors: no real sensor repeats its numbers for long, since noise change
 Six numbers that repeat for a tenth of a second come from sensors that have stopped, unless the
 device may be at rest. One sensor alone: loggers repeat samples of a slow one, and a coarse one at
 rest measures the same numbers for minutes. So its values must repeat for half a second in which the
-other one shows motion that they rule out, by the rules of `sequences.inspection.samples`.
-From then on it counts as stopped until its values change. Samples of a stopped sensor are dropped,
-so that they are treated as a gap. A sensor whose values have never changed is dead (`units`). Three
-zeros of an accelerometer are no measurement at all, not even of a free fall, which has noise.
+other one shows motion that they rule out, by the rules of `sequences.inspection.samples`; or those
+of one axis of the gyroscope, below any limit, while both others vary by more than digits hide. From
+then on it counts as stopped until its values change. Samples of a stopped sensor are dropped, so
+that they are treated as a gap. (An axis of the accelerometer that stops at a usual force costs less
+than the heading that is lost in a gap.) A sensor whose values have never changed is dead (`units`);
+an axis may be constant from the beginning, as in data simulated in a plane. Three zeros of an
+accelerometer are no measurement at all, not even of a free fall, which has noise.
 
 Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values of a moving
-axis that repeat exactly and more than once at the largest magnitude measured so far; two that are
-equal by chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so
-these are only flagged. A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its
-accelerometer measures 8 or 16: the force that it misses is of its limit's size. What recurs, as in
-a runner's pocket with a limit of 2 g, the filter learns from its innovations; what happens once
-must be said at once.
+axis that repeat exactly and more than once at the largest magnitude measured so far, beside steps
+that are too large for a peak rounded to the axis's digits; two that are equal by chance, at a
+magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are only flagged.
+A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its accelerometer measures 8
+or 16: the force that it misses is of its limit's size. What recurs, as in a runner's pocket with a
+limit of 2 g, the filter learns from its innovations; what happens once must be said at once.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
+from operator import ne
 from typing import Literal
 
 import numpy as np
@@ -121,6 +126,27 @@ _ALONE_SAMPLES = round(MIN_RATE * _ALONE_SECONDS)
 """Minimum number of samples in that time: a gap shows no motion."""
 
 
+_TURNS, _LEAST_LIMIT = 0.06, 3.0
+"""Standard deviation of the other two rates [rad/s] above which no digits of a gyroscope hide the
+third one (three of a degree per second), and the least rate that may be its limit [rad/s]."""
+
+
+def _contradicts_constant_rate(
+    axis: int, time: FloatArray, gyro: FloatArray, accel: FloatArray
+) -> bool:
+    """Return whether both other rates vary, as in no rotation with a constant third one."""
+    others = np.delete(gyro, axis, axis=1).std(axis=0)
+    return bool(others.min() > _TURNS and abs(gyro[0, axis]) < _LEAST_LIMIT)
+
+
+_PARTS: list[tuple[Stopped, slice, Moves]] = [
+    ("gyroscope", slice(1, 4), contradicts_constant_gyro),
+    ("accelerometer", slice(4, 7), contradicts_constant_accel),
+    *(("gyroscope", slice(k + 1, k + 2), partial(_contradicts_constant_rate, k)) for k in range(3)),
+]
+"""What may stop alone, its columns, and whether others show motion that its values rule out."""
+
+
 class FrozenSensorDetector:
     """Detects sensors that have stopped and repeat their last values.
 
@@ -132,39 +158,37 @@ class FrozenSensorDetector:
         self._gravity = gravity
         self._last: Sample = (math.nan,) * 7  # before the first: no value equals NaN
         self._since = math.inf  # time of the first of equal samples [s]
-        self._unclear = True  # whether a sensor repeats its values, or has never changed them
-        self._gyro, self._accel = _Repetition(), _Repetition()
+        self._unclear = True  # whether a part repeats its values, or has never changed them
+        self._parts = [_Repetition() for _ in _PARTS]
 
     def stopped(self, sample: Sample) -> Stopped | None:
         """Return what has stopped according to a sample (time, gyro, accel); None if nothing."""
         last, self._last = self._last, sample
-        if self._accel.varied and not any(sample[4:]):
+        accel = self._parts[1]
+        if accel.varied and not any(sample[4:]):
             return "accelerometer" if any(sample[1:4]) else "both"
-        # Nearly all samples end here: comparing two numbers is the cheapest proof.
-        if sample[1] != last[1] and sample[4] != last[4] and not self._unclear:
+        # Most samples end here: comparing the numbers is the cheapest proof.
+        if not self._unclear and all(map(ne, sample, last)):
             self._since = sample[0]
             return None
         return self._judged(last, sample)
 
     def _judged(self, last: Sample, sample: Sample) -> Stopped | None:
-        same_gyro, same_accel = sample[1:4] == last[1:4], sample[4:] == last[4:]
-        if not (same_gyro and same_accel):
+        if sample[1:] != last[1:]:
             self._since = math.inf if math.isnan(last[0]) else sample[0]
         elif sample[0] - self._since > _FROZEN_SECONDS and not self._looks_at_rest():
             return "both"
-        gyro, accel = self._gyro, self._accel
-        # Both, whatever the first says: each has to know when its values change.
-        pairs = (
-            (gyro, same_gyro, contradicts_constant_gyro),
-            (accel, same_accel, contradicts_constant_accel),
-        )
-        for sensor, same, moves in pairs:
-            if same:
-                sensor.add(last, sample, moves)
+        self._unclear, found = False, None
+        # All of them, whatever the first says: each has to know when its values change.
+        for part, (sensor, columns, moves) in zip(self._parts, _PARTS, strict=True):
+            if same := sample[columns] == last[columns]:
+                part.add(last, sample, moves)
             else:
-                sensor.restart(last)
-        self._unclear = same_gyro or same_accel or not (gyro.varied and accel.varied)
-        return "gyroscope" if gyro.stopped else "accelerometer" if accel.stopped else None
+                part.restart(last)
+            self._unclear |= same or not part.varied
+            if part.stopped:
+                found = found or sensor
+        return found
 
     def _looks_at_rest(self) -> bool:
         gyro, accel = self._last[1:4], self._last[4:]
@@ -173,25 +197,25 @@ class FrozenSensorDetector:
 
 
 class _Repetition:
-    """Samples in which one sensor repeats its values.
+    """Samples in which a sensor, or one axis of it, repeats its values.
 
     Attributes:
         varied: whether its values have ever changed.
-        stopped: whether the other sensor has shown motion that its values rule out.
+        stopped: whether others have shown motion that its values rule out.
     """
 
     def __init__(self) -> None:
         self.varied = self.stopped = False
-        self._samples: list[Sample] = []  # since the other sensor was last asked
+        self._samples: list[Sample] = []  # since others were last asked
 
     def restart(self, last: Sample) -> None:
-        """Note that the sensor's values differ from those of the sample before, if there is one."""
+        """Note that the values differ from those of the sample before, if there is one."""
         self.varied, self.stopped = not math.isnan(last[0]), False
         if self._samples:
             self._samples = []
 
     def add(self, last: Sample, sample: Sample, moves: Moves) -> None:
-        """Add a sample that repeats the values of the last one; ask the other sensor for motion."""
+        """Add a sample that repeats the values of the last one; ask others for motion."""
         if self.stopped or not self.varied:
             return
         if sample[0] < last[0]:  # a late sample, or the one before was ahead of its time
@@ -208,6 +232,14 @@ class _Repetition:
 _MOVING_RANGE = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
 _LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
 """An axis within this range and size [rad/s], [m/s^2] may repeat itself: coarse digits at rest."""
+
+_COARSEST = np.array([0.02, 0.02, 0.02, 0.15, 0.15, 0.15])
+"""Digit of an axis until a smaller one has shown [rad/s], [m/s^2]: a degree per second, and 8 bits
+of 2 g."""
+
+_ROUNDED_STEP = 5.0
+"""Largest step beside a peak that is rounded to equal values, in digits: n of them lie on a
+parabola that falls by 4 / n digits in the next step; rounding adds one, noise two."""
 
 _MIN_REPEATS = 2.0
 """Minimum number of repetitions at the same limit that cannot be chance."""
@@ -226,6 +258,7 @@ class OutlierDetector:
 
     def __init__(self) -> None:
         self.largest = np.zeros(6)
+        self._digits = _COARSEST  # smallest step of each axis so far
         self._repeats = np.zeros(6)  # of each axis at its current largest magnitude
         self._impacts = 0.0  # recent ones, each weighted by its age
         self._time = -math.inf
@@ -244,7 +277,7 @@ class OutlierDetector:
         self.largest = largest
         saturated = _NO_AXES
         if not steps.all():
-            saturated = self._count_saturated(values)
+            saturated = self._count_saturated(values, np.abs(steps))
         bad = (spikes + saturated) > 0
         if not bad.any():
             return NO_FLAGS
@@ -265,11 +298,17 @@ class OutlierDetector:
         self._impacts, self._time = recent + 1.0, float(time[-1])
         return float((_MISSED * self.largest[3:] * seconds).max() / (1.0 + recent))
 
-    def _count_saturated(self, values: FloatArray) -> FloatArray:
-        """Return the number of samples per axis (6,) that repeat at the axis's limit."""
-        size = np.abs(values)
+    def _count_saturated(self, values: FloatArray, steps: FloatArray) -> FloatArray:
+        """Return the number of samples per axis (6,) that repeat at the axis's limit.
+
+        The steps (n - 1, 6) are those before spikes were replaced, which digits do not explain; nor
+        those from the first sample, which may be interpolated.
+        """
+        shown = np.where(steps[1:] > 0.0, steps[1:], np.inf).min(axis=0, initial=np.inf)
+        self._digits = np.minimum(self._digits, shown)
+        at_limit: BoolArray = np.abs(values) >= self.largest
         moving = (np.ptp(values, axis=0) > _MOVING_RANGE) | (self.largest > _LARGE_VALUE)
-        repeated: BoolArray = (values[1:] == values[:-1]) & (size[1:] >= self.largest) & moving
-        count = repeated.sum(axis=0)
-        self._repeats = self._repeats + count
+        count = ((values[1:] == values[:-1]) & at_limit[1:] & moving).sum(axis=0)
+        beside = np.where(at_limit[1:] | at_limit[:-1], steps, 0.0).max(axis=0)
+        self._repeats = self._repeats + np.where(beside > _ROUNDED_STEP * self._digits, count, 0)
         return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))

@@ -196,7 +196,7 @@ def preintegrate(
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
     densities = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
     seconds = float(time[-1] - time[0])
-    if seconds * math.sqrt(3.0) * float(np.abs(rate).max()) > _MAX_TURN:
+    if seconds * math.sqrt(3.0) * float(np.abs(rate).max()) > MAX_TURN:
         rate, densities = _within_a_turn(rate, dt, densities)
     current = densities[0]
     uniform = all(density is current for density in densities)
@@ -222,11 +222,11 @@ def _within_a_turn(
     Return rates (n, 3) and densities; if the rotation was too large, the turn is unknown.
     """
     turn = float(np.linalg.norm(np.cumsum(rate * dt[:, None], axis=0), axis=1).max())
-    if turn <= _MAX_TURN:
+    if turn <= MAX_TURN:
         return rate, densities
     unknown = math.pi / math.sqrt(dt.sum())
     wider = [replace(d, gyro_noise=max(d.gyro_noise, unknown)) for d in densities]
-    return rate * (_MAX_TURN / turn), wider
+    return rate * (MAX_TURN / turn), wider
 
 
 def corrected_increments(
@@ -262,9 +262,9 @@ def corrected_increments(
     return dt, constant[:, :, 0], force[:, :, 0]
 
 
-_MAX_TURN = 6.0
-"""Maximum rotation of a segment [rad]; over a tenth of a second no device turns by so much, and its
-turn is then unknown: a gyroscope in deg/s that has not been noticed yet."""
+MAX_TURN = 6.0
+"""Maximum rotation of a segment [rad]; over a tenth of a second, or between keyframes of the graph,
+no device turns by so much. Its turn is then unknown: a gyroscope in deg/s, not noticed yet."""
 
 _CROSS_WEIGHTS = np.array([1.0 / 24.0, 1.0 / 12.0])
 _EYE = np.eye(3)

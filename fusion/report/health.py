@@ -92,10 +92,9 @@ def _clock(health: Health) -> Iterator[Finding]:
 
 def _stopped(health: Health) -> Iterator[Finding]:
     for sensor, count in health.stopped.items():
-        other = "accelerometer" if sensor == "gyroscope" else "gyroscope"
         text = (
-            f"The {sensor} stopped: it repeats its value in {count} samples in which the {other} "
-            "shows motion; they were dropped."
+            f"The {sensor} stopped: it repeats its value, or one axis does, in {count} samples in "
+            "which the others show motion; they were dropped."
         )
         advice = (
             "Restart the device and record again; if it recurs, the sensor or the app is faulty."

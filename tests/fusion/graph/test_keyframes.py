@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import measured
+from simulated import Oracle, measured
 from support import GRAPH as CONFIG
 from support import nav_state, stream, true_start
 from told import health_lines
@@ -22,6 +22,8 @@ from stario.fusion.values.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.values.lie import yaw_twist
 from stario.fusion.values.state import NavState
 from stario.sequences import ImuNoise, about_z, position_nees, yaw_of
+from stario.sequences.simulation.insertion import insert_moment
+from stario.sequences.simulation.moments import Moment, MomentMotion, ramp
 
 
 def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
@@ -63,6 +65,27 @@ def test_the_track_follows_the_imu_between_keyframes(walk, make_oracle):
     truth = walk.truth.at(track.time)
     turned = (track.attitude_WB * truth.attitude_WB.inv()).magnitude()
     assert np.abs(np.diff(turned)).max() < 0.01
+
+
+def twice_about(rng: np.random.Generator, time: np.ndarray, attitude_LB: object) -> MomentMotion:
+    """Two turns of the device in half a second, as of a phone that is thrown and caught."""
+    count = len(time)
+    turn = 4.0 * np.pi * ramp((time - 1.0) / 0.8)[:, None] * [0.8, 0.6, 0.0]
+    return MomentMotion(np.zeros((count, 3)), turn, np.zeros(count), np.ones(count))
+
+
+def test_a_spin_of_two_turns_does_not_lose_the_heading():
+    walk = measured(3, 16.0, CONFIG)[0]
+    spun = insert_moment(walk, walk.truth, Moment("spin", 3.0, twice_about), 0.5, 0).sequence
+    oracle = Oracle(spun, spun.truth, CONFIG, noise=0.03, sigma=0.03)
+    start = true_start(walk)
+    track = graph(oracle, prior=start).run(spun)
+    last = stream(graph(oracle, prior=start), spun)[-1]
+    batch = track.trajectory.attitude_WB.as_matrix()[-1], track.covariance[-1]
+    truth = spun.truth.at(track.time[-1:]).attitude_WB.as_matrix()[0]
+    for R_WB, covariance in (batch, (last.R_WB, last.covariance)):
+        assert abs(yaw_twist(R_WB @ truth.T)) < 0.1
+        assert covariance[2, 2] < 0.1**2
 
 
 def smooth_turned(filtered, *others):

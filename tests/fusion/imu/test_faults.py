@@ -41,6 +41,14 @@ def test_coarse_values_that_repeat_while_rising_are_not_saturated():
     assert count_saturated(rising) == 0
 
 
+def test_peaks_rounded_to_coarse_digits_are_not_saturated(make_walk, still_model):
+    """Of 8 bits of 2 g, and of a degree per second."""
+    walk, digits = make_walk(3, 20.0), {"gyro": 0.02, "accel": 0.15}
+    coarse = {name: digit * np.round(getattr(walk, name) / digit) for name, digit in digits.items()}
+    health = Navigator(still_model, backend="ekf").run(replace(walk, **coarse)).health
+    assert health.flagged["saturated"] == 0
+
+
 def test_a_clipped_sine_is_saturated_at_its_limit():
     clipped = np.clip(8.0 * np.sin(np.arange(0.0, 40.0, 0.05)), -5.0, 5.0)
     stuck = int(((clipped[1:] == clipped[:-1]) & (np.abs(clipped[1:]) == 5.0)).sum())
@@ -217,6 +225,26 @@ def test_one_sensor_that_stops_makes_a_gap_and_is_named(walk, make_oracle, senso
     (line,) = [line for line in health_lines(track.health) if "stopped" in line]
     assert line.startswith(f"! The {NAMES[sensor]} stopped")
     assert not any("same rate" in line for line in health_lines(track.health))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_one_axis_of_the_gyroscope_that_stops_is_named(walk, still_model, axis):
+    gyro, dead = walk.gyro.copy(), (walk.time >= 8.0) & (walk.time < 12.0)
+    gyro[dead, axis] = gyro[np.argmax(dead), axis]
+    health = Navigator(still_model, backend="ekf").run(replace(walk, gyro=gyro)).health
+    assert health.stopped == {"gyroscope": pytest.approx(300, abs=60)}
+    ((start, length),) = health.gaps
+    assert start + length == pytest.approx(12.0, abs=0.05)
+
+
+def test_an_axis_may_be_constant_in_a_plane_or_between_coarse_digits(walk):
+    """Also one that is constant from the beginning, and one that reaches its limit."""
+    coarse = 0.02 * np.round(walk.gyro / 0.02), 0.15 * np.round(walk.accel / 0.15)
+    assert frozen_samples(walk.time, *coarse) == 0
+    planar = walk.gyro * [1.0, 1.0, 0.0]
+    assert frozen_samples(walk.time, planar, walk.accel) == 0
+    fast = walk.gyro + [0.0, 0.0, 8.0] * (walk.time[:, None] > 8.0)
+    assert frozen_samples(walk.time, np.minimum(fast, 4.0), walk.accel) == 0
 
 
 @pytest.mark.parametrize("sensor", NAMES)
