@@ -3,7 +3,7 @@
 README.md, "Magnetometer". The field's direction in the world is unknown, and indoors it wanders:
 
     azimuth = c + disturbance,   c constant and unknown at first
-                            disturbance Gauss-Markov over metres and seconds
+                            disturbance Gauss-Markov over metres
 
 The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it; h is Gauss-Markov, too. A
 field of unusual size or dip for the place has less weight, as does one that the device has
@@ -32,9 +32,11 @@ from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
-DISTURBANCE_METRES, DISTURBANCE_SECONDS = 5.0, 60.0
-"""Distance [m] and time [s] over which the disturbance decorrelates: the reach of a beam or a
-radiator, and the duration of other changes."""
+DISTURBANCE_METRES = 5.0
+"""Distance over which the disturbance decorrelates [m]: the reach of a beam or a radiator."""
+
+_ARMS_REACH = 1.0
+"""Distance up to which a device is at the same place [m], however it is moved to and fro."""
 
 HARD_IRON_SECONDS = 60.0
 """Time over which a calibration's hard iron decorrelates [s]: phones calibrate their magnetometer
@@ -107,6 +109,7 @@ class MagneticReference:
             field's, which the device had not followed.
         rotation: how the field has changed while the device rotated.
         pose: attitude R_WB (3, 3) and position p_W (3,) [m] at the last bearing.
+        place_W: (3,) the place whose disturbance is measured [m].
         offset_B: (3,) hard iron that no calibration has removed; bearings are without it [uT].
     """
 
@@ -120,6 +123,7 @@ class MagneticReference:
     held: bool = False
     rotation: FieldRotation = field(default_factory=FieldRotation)
     pose: tuple[FloatArray, FloatArray] | None = None
+    place_W: FloatArray | None = None
     offset_B: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
@@ -155,10 +159,18 @@ class MagneticReference:
 
     def travelled(self, s: EkfState) -> bool:
         """Return whether a state is at another place than the last bearing."""
-        if self.pose is None:
-            return False
-        x, y, _ = s.p_W - self.pose[1]
-        return math.hypot(x, y) > _NEW_PLACE
+        return self.pose is not None and _distance(s.p_W, self.pose[1]) > _NEW_PLACE
+
+    def placed(self, s: EkfState) -> tuple[MagneticReference, float]:
+        """Return the reference at a state's place, and its distance from the one before [m].
+
+        The distance is zero until it is out of the reach of an arm: while people shake a phone
+        where they stand, its disturbance stays what it is.
+        """
+        metres = math.inf if self.place_W is None else _distance(s.p_W, self.place_W)
+        if metres <= _ARMS_REACH:
+            return self, 0.0
+        return changed(self, place_W=s.p_W), metres
 
     def is_held(self, measured: float) -> bool:
         """Return whether a field (size [uT]) is the last one, carried on by the gyroscope."""
@@ -189,6 +201,10 @@ class MagneticReference:
         places = self.places + 1
         spread = self.spread + (deviation - self.spread) / min(places, _AVERAGING_COUNT)
         return changed(means, spread=spread, places=places)
+
+
+def _distance(a: FloatArray, b: FloatArray) -> float:
+    return math.hypot(a[0] - b[0], a[1] - b[1])
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
@@ -251,15 +267,14 @@ def without_field(s: EkfState) -> EkfState:
     return changed(s, covariances=s.covariances[:, :n, :n], field=None)
 
 
-def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
-    """Return the state with its azimuth and hard iron propagated for a time [s].
+def propagated_field(s: EkfState, metres: float, seconds: float, sigma: float) -> EkfState:
+    """Return the state with its azimuth after a distance [m] and its hard iron after a time [s].
 
     `sigma` is the standard deviation of the azimuth about its mean [rad].
     """
     assert s.field is not None  # set by `with_field`
-    metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     row = s.field_row + 1
-    moved = math.exp(-metres / DISTURBANCE_METRES - seconds / DISTURBANCE_SECONDS)
+    moved = math.exp(-metres / DISTURBANCE_METRES)
     iron = math.exp(-seconds / HARD_IRON_SECONDS)
     kept = np.array([moved, iron, iron, iron])
     sigmas = np.array([sigma, *[HARD_IRON_SIGMA] * 3])
@@ -276,10 +291,11 @@ def update_bearing(
     now, measured = s.time, float(np.linalg.norm(m_B))
     if measured > _STRONGEST:
         return s, UpdateResult("too strong to be in uT"), changed(reference, time=now)
+    reference, metres = reference.placed(s)
     if s.field is None:
         s = with_field(s, m_B)
     elif math.isfinite(reference.time):
-        s = propagated_field(s, now - reference.time, reference.disturbance_sigma)
+        s = propagated_field(s, metres, now - reference.time, reference.disturbance_sigma)
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     horizontal = math.hypot(m_W[0], m_W[1])

@@ -116,6 +116,25 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown():
     assert ekf.state.P[2, 2] > 0.99 * yaw_variance
 
 
+def azimuth_variance(places: np.ndarray) -> float:
+    """Variance of the azimuth after a bearing each half second, in a hand that moves at 2 m/s."""
+    s, reference = state(), MagneticReference()
+    n = s.field_row + 2
+    P = s.covariances.copy()
+    P[:, n:], P[:, :, n:] = 0.0, 0.0  # without a hard iron
+    for k, x in enumerate(places):
+        X = s.X.copy()
+        X[0, 0, 3:] = 2.0, x
+        s = replace(s, time=0.5 * k, X=X, covariances=P if k == 0 else s.covariances)
+        s, _, reference = update_bearing(s, reference, s.R_WB.T @ FIELD_W)
+    return s.P[s.field_row, s.field_row]
+
+
+def test_one_place_tells_its_own_azimuth_however_a_device_is_shaken_there():
+    shaken, walked = azimuth_variance(0.2 * (np.arange(60) % 2)), azimuth_variance(np.arange(60))
+    assert walked < DISTURBANCE_SIGMA**2 < shaken
+
+
 def weight_left(reference: MagneticReference, scale: float = 1.0) -> float:
     """Variance of what is unknown of the field after a bearing 0.2 rad off."""
     s = state()
@@ -185,7 +204,7 @@ def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
     P[:, row : row + 3, row : row + 3] = np.eye(3)
     field = replace(s.field, hard_iron_B=np.array([20.0, -25.0, 10.0]))
     known = replace(s, covariances=P, field=field)
-    later = propagated_field(known, 3.0 * HARD_IRON_SECONDS, DISTURBANCE_SIGMA)
+    later = propagated_field(known, 0.0, 3.0 * HARD_IRON_SECONDS, DISTURBANCE_SIGMA)
     assert np.abs(later.field.hard_iron_B).max() < 2.0
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
 
