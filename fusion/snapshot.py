@@ -22,7 +22,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 42
+FORMAT, VERSION = "stario snapshot", 43
 
 _PACKAGES = ("fusion.filter", "fusion.graph", "fusion.imu")
 _MODULES = """

@@ -132,6 +132,7 @@ class EstimatorState:
         health = self.counts.health(counts, state or self.nav_state())
         health.accel_noise_factor = self.statistics.accel_factor
         health.network_error_level = self.statistics.error_level
+        health.jumps = [(*jump,) for jump in self.map_frame.jumps]
         if f.declination is None:
             return health
         if not self.map_frame.yaw_known:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,6 +103,23 @@ def unknown_yaw(pivot: FloatArray, since: float, until: float) -> FrameTransform
     return FrameTransform(np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW)
 
 
+class Jump(NamedTuple):
+    """Positions in a row that proved the track wrong and moved it.
+
+    Unless the track would be as long as the way between positions, only in a wrong direction, what
+    displacements and rest are relative to has moved from the last position that agreed to the
+    first of those, as a vehicle does: only the IMU links both sides.
+    """
+
+    since: float
+    """Time of the last position that agreed with the track [s]; minus infinity if none has, or if
+    the direction was wrong: then nothing but the track is known to have moved."""
+    until: float
+    """Time of the first position that moved it [s]."""
+    metres: float
+    """By how far the track was moved [m]."""
+
+
 @dataclass(frozen=True, eq=False)
 class MapFrameState:
     """State of the map frame.
@@ -116,10 +134,11 @@ class MapFrameState:
         alignment: positions since it was placed, relative to the pivot, while its yaw is unknown.
         distance_mismatches: number of latest positions in a row whose distance from the pivot
             differs from the track's.
-        outlier_residuals: (3,) residuals of the latest positions if they were outliers [m].
+        agreed: time [s] and place (3,) [m] of the latest position that agreed with the track.
+        outliers: times [s] and residuals (3,) [m] of the latest positions if they were outliers.
         earlier_unknown_yaws: yaw uncertainty of stretches that were placed before a gap and never
             turned, applied once the frame's yaw is known.
-        jumps: number of times that the track, not the positions, proved to be wrong.
+        jumps: where the track, not the positions, proved to be wrong, in order.
         yaw_variance: variance of the track's own yaw when it was placed [rad^2].
         since_jump: number of positions since the last jump.
         yaw_offset_unknown: whether the track's covariance does not know that its yaw is not the
@@ -134,9 +153,10 @@ class MapFrameState:
     pivot_variance: float = math.inf
     alignment: PlanarAlignment = field(default_factory=PlanarAlignment)
     distance_mismatches: int = 0
-    outlier_residuals: tuple[FloatArray, ...] = ()
+    agreed: tuple[float, FloatArray] = field(default_factory=lambda: (-math.inf, np.zeros(3)))
+    outliers: tuple[tuple[float, FloatArray], ...] = ()
     earlier_unknown_yaws: tuple[FrameTransform, ...] = ()
-    jumps: int = 0
+    jumps: tuple[Jump, ...] = ()
     yaw_variance: float = 0.0
     yaw_offset_unknown: bool = False
     since_jump: float = math.inf

@@ -18,7 +18,7 @@ from numpy.linalg import norm
 from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf import Updated
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unknown_yaw
+from stario.fusion.filter.frame_transform import FrameTransform, Jump, MapFrameState, unknown_yaw
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.kalman import UpdateResult
@@ -154,13 +154,16 @@ def _needs_placing(fix: Fix, m: Mapped) -> tuple[bool, Mapped]:
         return not frame.position_known, m
     if _SIGMA_RATIO**2 * float(np.trace(fix.covariance[:2, :2])) < frame.pivot_variance:
         return True, m
-    now, pivot = m.ekf.nav_state(), frame.pivot
-    fix_distance, track_distance = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
-    differs = abs(fix_distance - track_distance) > 3.0 * plane_sigma(
-        now, 6, fix
-    ) + _LENGTH_TOLERANCE * min(fix_distance, track_distance)
-    mismatches = frame.distance_mismatches + 1 if differs else 0
+    mismatches = frame.distance_mismatches + 1 if _distance_differs(fix, m, frame.pivot) else 0
     return mismatches >= _OUTLIERS_IN_A_ROW, m.with_frame(distance_mismatches=mismatches)
+
+
+def _distance_differs(fix: Fix, m: Mapped, place: FloatArray) -> bool:
+    """Return whether a position is nearer to a place on the track than the track, or further."""
+    now = m.ekf.nav_state()
+    fix_distance, track_distance = norm((fix.value - place)[:2]), norm((now.p_W - place)[:2])
+    tolerance = _LENGTH_TOLERANCE * min(fix_distance, track_distance)
+    return bool(abs(fix_distance - track_distance) > 3.0 * plane_sigma(now, 6, fix) + tolerance)
 
 
 def _placed(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform]:
@@ -254,22 +257,34 @@ def _with_position(fix: Fix, before: Mapped, gate: float) -> tuple[Mapped, Updat
     """Update with a position; inflate an outlier, but move the track after similar ones."""
     since_jump = before.frame.since_jump + 1
     after, result = _measured(before.ekf, fix, gate)
-    residual = result.residual
-    aligned: tuple[FloatArray, ...] = ()
+    residual, agreed = result.residual, before.frame.agreed
+    aligned: tuple[tuple[float, FloatArray], ...] = ()
     if residual is not None and result.gated:
         aligned = tuple(
-            r
-            for r in before.frame.outlier_residuals
+            (time, r)
+            for time, r in before.frame.outliers
             if r @ residual > _SAME_DIRECTION * norm(r) * norm(residual)
         )
-        aligned = (*aligned, residual)
-    m = Mapped(after, changed(before.frame, since_jump=since_jump, outlier_residuals=aligned))
+        aligned = (*aligned, (fix.time, residual))
+    elif residual is not None:
+        agreed = fix.time, after.p_W
+    frame = changed(before.frame, since_jump=since_jump, outliers=aligned, agreed=agreed)
     if residual is None or len(aligned) < _OUTLIERS_IN_A_ROW:
-        return m, result
-    moved = before.ekf.with_position_inflated(float(norm(residual)))
-    after, result = _measured(moved, fix, gate)
-    jumps = m.frame.jumps + 1
-    m = Mapped(after, changed(m.frame, outlier_residuals=(), jumps=jumps, since_jump=0))
+        return Mapped(after, frame), result
+    metres = float(norm(residual))
+    since, place = agreed
+    jump = Jump(
+        since if _distance_differs(fix, before, place) else -math.inf, aligned[0][0], metres
+    )
+    after, result = _measured(before.ekf.with_position_inflated(metres), fix, gate)
+    frame = changed(
+        frame,
+        outliers=(),
+        agreed=(fix.time, after.p_W),
+        jumps=(*frame.jumps, jump),
+        since_jump=0,
+    )
+    m = Mapped(after, frame)
     if since_jump <= _POSITIONS_APART and m.frame.yaw_known:
         # Its direction has proved to be wrong: let later fixes turn the track from here on.
         m = m.with_frame(

@@ -57,7 +57,7 @@ class FixedLag:
         self._origin_W = first.p_W  # of the graph; see `EkfState`
         self.builder = GraphBuilder(self._config, local, count, streaming=True)
         self._ahead = initialised(local, 0)  # the newest state, propagated from the last keyframe
-        self._frame = first.map_frame, filtered.map_frame.jumps
+        self._frame = first.map_frame, len(filtered.map_frame.jumps)
         # Of the gyroscope bias's prior, narrowed since as in the filter [rad^2/s^2].
         self._bias_variance = filtered.bias_prior.variance
 
@@ -123,7 +123,7 @@ class FixedLag:
     def _is_stale(self, filtered: EstimatorState) -> bool:
         """Return whether the filter has since changed the state from which the graph began."""
         frame = filtered.map_frame
-        moved = (len(frame.transforms), frame.jumps) != self._frame
+        moved = (len(frame.transforms), len(frame.jumps)) != self._frame
         return moved or filtered.bias_prior.variance > _WIDER * self._bias_variance
 
     def _narrow_prior(self, variance: float) -> None:

@@ -64,7 +64,7 @@ def health_findings(health: Health) -> list[Finding]:
         text = "Too early to judge the motion: it takes ten seconds of it."
         found += [*_flagged(health), _found(TOO_EARLY, text)]
     found += [*_floors(health), *_corrections(health), *_field(health)]
-    found += [*_fixes(health), *_direction(health)]
+    found += [*_fixes(health), *_jumps(health), *_direction(health)]
     notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
     return found + [Finding(f"note_{k}", note) for k, note in enumerate(notes)]
 
@@ -296,6 +296,25 @@ def _fixes(health: Health) -> Iterator[Finding]:
         text += f", {gated} of them with less weight, since the track contradicts them"
     text += f"; {_counted(other)}." if other else "."
     yield Finding("fixes", text, advice, "warning" if wrong else "note", health.fixes)
+
+
+def _jumps(health: Health) -> Iterator[Finding]:
+    if not health.jumps:
+        return
+    since, until, metres = max(health.jumps, key=lambda jump: jump[2])
+    count = len(health.jumps)
+    times = "" if count == 1 else f"{count} times, the most "
+    when, left_out = f"from {until:.0f} s on", ""
+    if math.isfinite(since):
+        when = f"between {since:.0f} s and {until:.0f} s"
+        left_out = "; the displacements in between were left out, as in a vehicle"
+    text = (
+        f"Positions in a row contradict the track {times}by {metres:.0f} m {when}: it was moved to "
+        f"them{left_out}."
+    )
+    advice = "If nothing carried the device there, check these positions."
+    values = {"count": count, "since_s": since, "until_s": until, "metres": metres}
+    yield _found("jumps", text, advice, values)
 
 
 def _direction(health: Health) -> Iterator[Finding]:

@@ -1,16 +1,18 @@
 """Fixes in map coordinates, after gaps, and refused ones, for the filter and for the graph."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from simulated import measured
+from simulated import Oracle, measured
 from support import GRAPH as CONFIG
 from support import Altered, lying, stream
 
-from stario.fusion import Fix, Navigator, NavState, PriorPose, position_fix, yaw_fix
+from stario.fusion import Fix, Navigator, NavState, PriorPose, Track, position_fix, yaw_fix
 from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.planar_alignment import PlanarAlignment
+from stario.fusion.report.health import health_findings
 from stario.fusion.values.lie import yaw_twist
 from stario.sequences import ImuSequence, about_z, yaw_of
 from stario.sequences.accuracy.metrics import pose_errors
@@ -159,6 +161,55 @@ def test_a_wrong_first_position_does_not_turn_the_track(backend):
     end = fixes[-1]
     at_end = min(states, key=lambda s: abs(s.time - end.time))
     assert np.linalg.norm(at_end.p_W - end.value) < 1.5
+
+
+def carried(walk: ImuSequence, start: float, stop: float, metres: float) -> ImuSequence:
+    """The walk in a vehicle that starts and stops then and goes that far along x."""
+
+    def ride(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s = np.clip((time - start) / (stop - start), 0.0, 1.0)
+        speed = 2.0 * metres / (stop - start)
+        distance = metres * (s - np.sin(2.0 * np.pi * s) / (2.0 * np.pi))
+        acceleration = speed * np.pi / (stop - start) * np.sin(2.0 * np.pi * s)
+        return np.outer(distance, [1.0, 0.0, 0.0]), np.outer(acceleration, [1.0, 0.0, 0.0])
+
+    attitude = walk.truth.at(np.clip(walk.time, *walk.truth.time[[0, -1]])).attitude_WB
+    accel = walk.accel + attitude.inv().apply(ride(walk.time)[1])
+    position_W = walk.truth.position_W + ride(walk.truth.time)[0]
+    return replace(walk, accel=accel, truth=replace(walk.truth, position_W=position_W))
+
+
+RIDE = (20.0, 40.0, 150.0)
+"""Start and stop [s] of a vehicle, and its way [m]."""
+
+
+def ridden(first_fix: float) -> tuple[ImuSequence, Oracle, list[Fix]]:
+    """A walk with the ride, displacements relative to the vehicle, and positions beside it."""
+    walk, _, _ = measured(3, 60.0, CONFIG)
+    ride = carried(walk, *RIDE)
+    oracle = Oracle(ride, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    times = np.concatenate([np.arange(first_fix, 20.0, 3.0), np.arange(41.0, 59.0, 3.0)])
+    return ride, oracle, fixes_of(ride, times, np.zeros(3))
+
+
+def beside_ride(track: Track, ride: ImuSequence, first: float) -> np.ndarray:
+    """Horizontal errors [m] from `first` on before the ride, and from the fixes after it on."""
+    time = track.time[track.time < ride.truth.time[-1]]
+    time = time[((time > first) & (time < 20.0)) | (time > 41.0)]
+    true = about_z(2.0).apply(ride.truth.at(time).position_W)
+    return np.linalg.norm((track.trajectory.at(time).position_W - true)[:, :2], axis=1)
+
+
+def test_a_ride_between_positions_bends_neither_side_of_the_smoothed_track():
+    ride, oracle, fixes = ridden(2.0)
+    track = Navigator(oracle, CONFIG).run(ride, fixes=fixes)
+    assert beside_ride(track, ride, 2.0).max() < 1.5
+    ((since, until, metres),) = track.health.jumps
+    assert 15.0 < since < 20.0 < 40.0 < until < 42.0
+    assert metres == pytest.approx(150.0, abs=10.0)
+    (found,) = (f for f in health_findings(track.health) if f.code == "jumps")
+    assert found.level == "warning"
+    assert f"between {since:.0f} s and {until:.0f} s" in found.text
 
 
 @pytest.mark.slow
