@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -134,7 +133,7 @@ def _without_rides(records: Sequence[Record], jumps: Sequence[Jump]) -> list[Rec
 
     def carried(stop: float) -> bool:
         """Return whether the second that ends then overlaps such a time."""
-        return any(-math.inf < j.since < stop < j.until + WINDOW_SECONDS for j in jumps)
+        return any(j.carried and j.since < stop < j.until + WINDOW_SECONDS for j in jumps)
 
     return [
         record._replace(offered=None, zero_velocity=None)

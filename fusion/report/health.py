@@ -301,19 +301,19 @@ def _fixes(health: Health) -> Iterator[Finding]:
 def _jumps(health: Health) -> Iterator[Finding]:
     if not health.jumps:
         return
-    since, until, metres = max(health.jumps, key=lambda jump: jump[2])
+    since, until, metres, carried = max(health.jumps, key=lambda jump: jump[2])
     count = len(health.jumps)
     times = "" if count == 1 else f"{count} times, the most "
-    when, left_out = f"from {until:.0f} s on", ""
-    if math.isfinite(since):
-        when = f"between {since:.0f} s and {until:.0f} s"
-        left_out = "; the displacements in between were left out, as in a vehicle"
-    text = (
-        f"Positions in a row contradict the track {times}by {metres:.0f} m {when}: it was moved to "
-        f"them{left_out}."
-    )
+    when = f"from {until:.0f} s on: the track was moved to them"
+    if carried:
+        when = (
+            f"between {since:.0f} s and {until:.0f} s, as if a vehicle had carried the device: the "
+            "track was moved to them, and the smoothed one leaves out the displacements in between"
+        )
+    text = f"Positions in a row contradict the track {times}by {metres:.0f} m {when}."
     advice = "If nothing carried the device there, check these positions."
     values = {"count": count, "since_s": since, "until_s": until, "metres": metres}
+    values |= {"carried": carried}
     yield _found("jumps", text, advice, values)
 
 
