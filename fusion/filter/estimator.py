@@ -101,6 +101,7 @@ def step(
         used = height.yielding(offered, climb_rate)
     s, outcome, rejected_later = _with_displacement(s, used, config)
     s, before = s.with_correction(before, "network"), s.ekf
+    s = _with_ride(s, interval.stop, offered, outcome, zero_velocity)
     s, bearing = _with_bearing(s, interval)
     s = s.with_correction(before, "magnetic field")
     s, north = _with_north(s, config)
@@ -278,6 +279,19 @@ def _with_displacement(
     )
     s = changed(s, statistics=statistics, counts=s.counts.add_displacement(result))
     return s.with_hypotheses(after), result, rejected_later
+
+
+def _with_ride(
+    s: EstimatorState,
+    stop: float,
+    offered: WindowDisplacement | None,
+    outcome: UpdateResult | None,
+    zero_velocity: ZeroVelocity | None,
+) -> EstimatorState:
+    """Note whether the device may ride in a vehicle."""
+    if zero_velocity is not None:
+        return changed(s, ride=s.ride.at_rest(stop))
+    return changed(s, ride=s.ride.after(stop, offered, outcome))
 
 
 def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorState, Gained | None]:

@@ -7,7 +7,7 @@ the next thing to try. `stario.sequences.findings.verdict` joins them with those
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from stario.fusion.filter.innovations import USUAL_LEVEL
@@ -64,7 +64,7 @@ def health_findings(health: Health) -> list[Finding]:
         text = "Too early to judge the motion: it takes ten seconds of it."
         found += [*_flagged(health), _found(TOO_EARLY, text)]
     found += [*_floors(health), *_corrections(health), *_field(health)]
-    found += [*_fixes(health), *_jumps(health), *_direction(health)]
+    found += [*_fixes(health), *_jumps(health), *_rides(health), *_direction(health)]
     notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
     return found + [Finding(f"note_{k}", note) for k, note in enumerate(notes)]
 
@@ -315,6 +315,23 @@ def _jumps(health: Health) -> Iterator[Finding]:
     values = {"count": count, "since_s": since, "until_s": until, "metres": metres}
     values |= {"carried": carried}
     yield _found("jumps", text, advice, values)
+
+
+def _rides(health: Health) -> Iterator[Finding]:
+    if not health.rides:
+        return
+    spans = [f"between {since:.0f} s and {until:.0f} s" for since, until in health.rides]
+    text = (
+        f"{_listed(spans)} the device was accelerated as no walk does while the network saw it "
+        "stand: in a vehicle? The track does not know that way."
+    )
+    advice = "Give position fixes after it: they place the track again."
+    yield _found("rides", text[0].upper() + text[1:], advice, {"rides": health.rides})
+
+
+def _listed(words: Sequence[str], most: int = 3) -> str:
+    rest = len(words) - most
+    return ", ".join(words[:most]) + (f" and {rest} times more" if rest > 0 else "")
 
 
 def _direction(health: Health) -> Iterator[Finding]:

@@ -33,6 +33,8 @@ class Health:
         jumps: where positions in a row contradicted the track and moved it: time of the last one
             that agreed and of the first that did not [s], distance [m], and whether the device
             was carried in between, as in a vehicle.
+        rides: start and stop of each stretch in which the network saw the device stand while it was
+            accelerated as no walk does, as in a vehicle [s], at most a hundred.
         fields_dropped: number of magnetometer samples dropped: their value or time is wrong, or
             repeats an earlier one.
         pressures: numbers of heights by the pressure applied (of these gated), of steps of the
@@ -75,6 +77,7 @@ class Health:
     bearings: dict[str, int] = field(default_factory=dict)
     corrections: list[tuple[float, float, float, str]] = field(default_factory=list)
     jumps: list[tuple[float, float, float, bool]] = field(default_factory=list)
+    rides: list[tuple[float, float]] = field(default_factory=list)
     fields_dropped: int = 0
     pressures: dict[str, int] = field(default_factory=dict)
     floors: list[FloorChange] = field(default_factory=list)
