@@ -355,5 +355,5 @@ def _with_clone(s: EstimatorState) -> EstimatorState:
     if len(slots) == len(s.ekf.clone_times):
         oldest = slots[0]
         released = s.ekf.clone_estimate(oldest, len(s.map_frame.transforms))
-        s = changed(s, released=released)
+        s = changed(s, released=s.with_way(released))
     return s.both(lambda state: ekf.clone(state, oldest).with_lost_yaw_forgotten())

@@ -116,7 +116,12 @@ class EstimatorState:
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""
-        return self.ekf.estimate(self.in_gap, len(self.map_frame.transforms))
+        return self.with_way(self.ekf.estimate(self.in_gap, len(self.map_frame.transforms)))
+
+    def with_way(self, estimate: Estimate) -> Estimate:
+        """Return an estimate that knows of the unknown way of rides since the last position."""
+        variance = self.ride.way_variance(estimate.time, self.map_frame.agreed[0])
+        return changed(estimate, way_variance=variance)
 
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""

@@ -26,6 +26,9 @@ _RIDING_NIS = 20.0
 """Mean NIS of a ride, halfway between what a standing device has without (up to 13) and in buses,
 metros and cars (from 28 on; EXPERIMENTS.md, "Rides")."""
 
+_SPEED_SIGMA = 7.5
+"""Standard deviation per axis of a vehicle's velocity [m/s]: uniform up to 15 m/s."""
+
 RIDES_LISTED = 100
 """Number of rides that are kept, the latest ones."""
 
@@ -61,6 +64,16 @@ class RideEvidence:
         if metres > _STANDING:
             return changed(after, standing_since=math.inf, riding=False)
         return after._standing(windows[0][0] - WINDOW_SECONDS, stop, nis > _RIDING_NIS)
+
+    def way_variance(self, time: float, known: float) -> float:
+        """Return the variance per axis of the way in rides between two times [m^2].
+
+        Args:
+            time: the later one [s].
+            known: the earlier one, at which a position was known [s]; or minus infinity.
+        """
+        seconds = (min(until, time) - max(since, known) for since, until in self.rides)
+        return (_SPEED_SIGMA * sum(each for each in seconds if each > 0.0)) ** 2
 
     def at_rest(self, stop: float) -> RideEvidence:
         """Return the evidence at rest: what follows is another acceleration."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.filter.ekf import initialised, propagate
-from stario.fusion.filter.estimates import nav_states
+from stario.fusion.filter.estimates import nav_states, with_unknown_way
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import with_unknown_yaws
 from stario.fusion.filter.gained import Gained
@@ -73,8 +73,10 @@ class FixedLag:
         """Return the newest state, given the filter's."""
         ahead = self._ahead.estimate(filtered.in_gap, self._frame[0])
         state = nav_states([ahead])[0].shifted(self._origin_W)
-        states = with_reported_covariances([state], [filtered.estimate()])
-        return with_unknown_yaws(states, filtered.map_frame.unknown_yaws)[0]
+        estimate = filtered.estimate()
+        (state,) = with_reported_covariances([state], [estimate])
+        state = with_unknown_way(state, estimate.way_variance)
+        return with_unknown_yaws([state], filtered.map_frame.unknown_yaws)[0]
 
     def step(self, filtered: EstimatorState, record: Record) -> None:
         """Follow the filter through an interval.

@@ -111,7 +111,7 @@ def test_bytes_that_are_no_snapshot_are_refused(walk, still_model):
         np.testing.assert_array_equal(navigator.state.p_W, before)
 
 
-LAYOUTS = {43: "a3baf47b"}
+LAYOUTS = {43: "2ad85bc1"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 

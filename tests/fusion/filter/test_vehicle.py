@@ -29,13 +29,17 @@ def test_a_ride_is_told_with_when_it_may_have_begun_and_ended(still_model, backe
     rides = {}
     for acceleration in (0.0, 1.2):
         navigator = Navigator(Altered(still_model, surely), backend=backend)
-        health = navigator.run(shaken(acceleration)).health
+        track = navigator.run(shaken(acceleration))
+        health = track.health
         assert not health.zero_velocity
         rides[acceleration] = health.rides
     assert rides[0.0] == []
     ((since, until),) = rides[1.2]
     assert since < 20.0
     assert until > 55.0
+    after, before = track.covariance[-1, 6, 6], (track.filtered or track).covariance[150, 6, 6]
+    assert np.sqrt(after) == pytest.approx(7.5 * (until - since), rel=0.05)
+    assert before < 25.0
     (found,) = (f for f in health_findings(health) if f.code == "rides")
     assert found.text.startswith(f"Between {since:.0f} s and {until:.0f} s the device")
     assert found.level == "warning"
