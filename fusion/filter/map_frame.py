@@ -4,7 +4,8 @@ README.md, "Fixes". A track that starts without a pose sets its first position a
 zero. The fixes that place and orient it are no small corrections and do not go through the filter's
 linearisation: the frame is transformed exactly (and the right-invariant error with it), then the
 covariance is inflated as if this shift or turn were unknown, then the fix is an ordinary update.
-After a gap in which the direction was lost, the same applies to the track from there on.
+After a gap in which the direction was lost, and after a ride before it was known, the same applies
+to the track from there on.
 """
 
 from __future__ import annotations
