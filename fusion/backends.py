@@ -15,7 +15,7 @@ import numpy as np
 
 from stario.fusion.filter import estimator
 from stario.fusion.filter.ekf_state import LOST_YAW
-from stario.fusion.filter.estimates import Estimate, nav_states
+from stario.fusion.filter.estimates import Estimate, nav_states, with_unknown_way
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_unknown_yaws
 from stario.fusion.filter.initial import PriorPose
@@ -83,6 +83,8 @@ def _smoothed_states(
         for before, after in zip(states, final, strict=True)
     ]
     solved = with_reported_covariances(solved, filtered.estimates, np.array(turns))
+    known = frame.agreed[0]
+    solved = [with_unknown_way(s, last.ride.way_variance(s.time, known)) for s in solved]
     return with_unknown_yaws(solved, frame.unknown_yaws), []
 
 

@@ -27,7 +27,7 @@ from stario.fusion.filter.jacobians import (
     velocity_jacobian,
     yaw_jacobian,
 )
-from stario.fusion.filter.kalman import Linear, UpdateResult, predict, update
+from stario.fusion.filter.kalman import TO_GATE, Linear, UpdateResult, predict, update
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
@@ -190,7 +190,7 @@ def update_position_W(
     predicted = s.X[0, :, 4]
     residual = p_W - s.origin_W - predicted
     measured = Linear(residual, position_jacobian(predicted), covariance)
-    return update(s, measured, gate, gains_from=REPORTED)
+    return update(s, measured, gate, gains_from=REPORTED, power=TO_GATE)
 
 
 def update_velocity_W(
@@ -198,7 +198,7 @@ def update_velocity_W(
 ) -> Updated:
     """Update with the current velocity (3,) [m/s] in the true W, covariance (3, 3)."""
     measured = Linear(v_W - s.v_W, velocity_jacobian(s.v_W), covariance)
-    return update(s, measured, gate, gains_from=REPORTED)
+    return update(s, measured, gate, gains_from=REPORTED, power=TO_GATE)
 
 
 def update_tilt(s: EkfState, up_B: FloatArray, sigma: float) -> Updated:
@@ -217,7 +217,7 @@ def update_yaw(s: EkfState, yaw: float, sigma: float, gate: float | None = None)
     if not math.isfinite(residual[0]):
         return s, UpdateResult("yaw not defined upside down")
     measured = Linear(residual, yaw_jacobian(s.R_WB), np.array([[sigma * sigma]]))
-    return update(s, measured, gate, gains_from=REPORTED)
+    return update(s, measured, gate, gains_from=REPORTED, power=TO_GATE)
 
 
 def update_bearing(

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.jacobians import CLONED, REPORTED, plain_covariance
-from stario.fusion.values.state import NavState, SmoothedPose
+from stario.fusion.filter.jacobians import CLONED, POSITION, REPORTED, plain_covariance
+from stario.fusion.values.state import NavState, SmoothedPose, changed
 from stario.sequences.sequence import FloatArray
 
 _CHUNK = 2000
@@ -32,6 +32,8 @@ class Estimate:
             as it is (see `EkfState`); zero for what a clone does not have.
         in_gap: as in `NavState`.
         map_frame: as in `NavState`.
+        way_variance: variance per horizontal axis of the way in vehicles that no position has
+            measured yet [m^2], of which the covariances know nothing.
     """
 
     time: float
@@ -42,6 +44,7 @@ class Estimate:
     covariances: FloatArray
     in_gap: bool = False
     map_frame: int = 0
+    way_variance: float = 0.0
 
 
 def plain_covariances(estimates: Sequence[Estimate], which: int = REPORTED) -> FloatArray:
@@ -64,8 +67,18 @@ def nav_states(estimates: Sequence[Estimate], which: int = REPORTED) -> list[Nav
         for e, covariance in zip(part, plain_covariances(part, which), strict=True):
             pose = e.X[:, :3], e.X[:, 3], e.X[:, 4] + e.origin_W
             biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
-            states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
+            state = NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame)
+            states.append(with_unknown_way(state, e.way_variance) if which == REPORTED else state)
     return states
+
+
+def with_unknown_way(state: NavState, variance: float) -> NavState:
+    """Return a state whose position has one more error, of a variance per horizontal axis [m^2]."""
+    if not variance:
+        return state
+    way = np.zeros(len(state.covariance))
+    way[POSITION.start : POSITION.start + 2] = variance
+    return changed(state, covariance=state.covariance + np.diag(way))
 
 
 def smoothed_pose(clone: NavState) -> SmoothedPose:

@@ -101,6 +101,7 @@ def step(
         used = height.yielding(offered, climb_rate)
     s, outcome, rejected_later = _with_displacement(s, used, config)
     s, before = s.with_correction(before, "network"), s.ekf
+    s = _with_ride(s, interval.stop, offered, outcome, zero_velocity)
     s, bearing = _with_bearing(s, interval)
     s = s.with_correction(before, "magnetic field")
     s, north = _with_north(s, config)
@@ -280,6 +281,19 @@ def _with_displacement(
     return s.with_hypotheses(after), result, rejected_later
 
 
+def _with_ride(
+    s: EstimatorState,
+    stop: float,
+    offered: WindowDisplacement | None,
+    outcome: UpdateResult | None,
+    zero_velocity: ZeroVelocity | None,
+) -> EstimatorState:
+    """Note whether the device may ride in a vehicle."""
+    if zero_velocity is not None:
+        return changed(s, ride=s.ride.at_rest(stop))
+    return changed(s, ride=s.ride.after(stop, offered, outcome))
+
+
 def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorState, Gained | None]:
     """Update with the magnetic field; return what it told about attitude and bias, too."""
     m_B, reference, before = interval.field_B, s.magnetic, s.ekf
@@ -341,5 +355,5 @@ def _with_clone(s: EstimatorState) -> EstimatorState:
     if len(slots) == len(s.ekf.clone_times):
         oldest = slots[0]
         released = s.ekf.clone_estimate(oldest, len(s.map_frame.transforms))
-        s = changed(s, released=released)
+        s = changed(s, released=s.with_way(released))
     return s.both(lambda state: ekf.clone(state, oldest).with_lost_yaw_forgotten())

@@ -20,6 +20,7 @@ from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.magnetic import MagneticReference, north_contradiction
 from stario.fusion.filter.record import UpdateCounts
+from stario.fusion.filter.vehicle import RideEvidence
 from stario.fusion.filter.zero_velocity import Stillness
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
@@ -59,6 +60,7 @@ class EstimatorState:
         statistics: what the innovations of displacements tell.
         alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
+        ride: whether the device rides in a vehicle, and when it did.
         climb_rate: vertical speed by the pressure while it climbs [m/s]; 0 on a floor.
         in_gap: whether the last interval had no samples.
         released: newest pose that left the window, corrected by the whole window; None at first.
@@ -74,6 +76,7 @@ class EstimatorState:
     statistics: InnovationStatistics = field(default_factory=InnovationStatistics)
     alternative: AlternativeHypothesis | None = None
     counts: UpdateCounts = field(default_factory=UpdateCounts)
+    ride: RideEvidence = field(default_factory=RideEvidence)
     climb_rate: float = 0.0
     in_gap: bool = False
     released: Estimate | None = None
@@ -113,7 +116,12 @@ class EstimatorState:
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""
-        return self.ekf.estimate(self.in_gap, len(self.map_frame.transforms))
+        return self.with_way(self.ekf.estimate(self.in_gap, len(self.map_frame.transforms)))
+
+    def with_way(self, estimate: Estimate) -> Estimate:
+        """Return an estimate that knows of the unknown way of rides since the last position."""
+        variance = self.ride.way_variance(estimate.time, self.map_frame.agreed[0])
+        return changed(estimate, way_variance=variance)
 
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""
@@ -132,6 +140,8 @@ class EstimatorState:
         health = self.counts.health(counts, state or self.nav_state())
         health.accel_noise_factor = self.statistics.accel_factor
         health.network_error_level = self.statistics.error_level
+        health.rides = list(self.ride.rides)
+        health.jumps = [(*jump,) for jump in self.map_frame.jumps]
         if f.declination is None:
             return health
         if not self.map_frame.yaw_known:

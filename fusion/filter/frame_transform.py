@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -82,6 +83,12 @@ class FrameTransform:
         )
 
 
+def turned_with(turn: FrameTransform, stretch: FrameTransform) -> FrameTransform:
+    """Return the same turn of another stretch, about that one's pivot."""
+    pivot, since, until = stretch.pivot, stretch.since, stretch.until
+    return changed(turn, shift=pivot - turn.R @ pivot, pivot=pivot, since=since, until=until)
+
+
 def _positive_part(P: FloatArray) -> FloatArray:
     """Return a symmetric matrix without its negative eigenvalues."""
     values, vectors = np.linalg.eigh(P)
@@ -102,6 +109,24 @@ def unknown_yaw(pivot: FloatArray, since: float, until: float) -> FrameTransform
     return FrameTransform(np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW)
 
 
+class Jump(NamedTuple):
+    """Positions in a row that proved the track wrong and moved it.
+
+    Where the device was carried, as in a vehicle, displacements and rest are relative to something
+    that moved, from the last position that agreed to the first of those: only the IMU links both.
+    """
+
+    since: float
+    """Time of the last position that agreed with the track [s]; minus infinity if none has."""
+    until: float
+    """Time of the first position that moved it [s]."""
+    metres: float
+    """By how far the track was moved [m]."""
+    carried: bool
+    """Whether the way between both positions, whatever its direction, is not as long as the track
+    and a vehicle may have taken it in that time."""
+
+
 @dataclass(frozen=True, eq=False)
 class MapFrameState:
     """State of the map frame.
@@ -114,12 +139,15 @@ class MapFrameState:
         since: time before which the next transforms leave the track as it is [s].
         pivot_variance: variance of the position that placed it, summed over x and y [m^2].
         alignment: positions since it was placed, relative to the pivot, while its yaw is unknown.
-        distance_mismatches: number of latest positions in a row whose distance from the pivot
-            differs from the track's.
-        outlier_residuals: (3,) residuals of the latest positions if they were outliers [m].
+        mismatches: times [s] of the latest positions in a row whose distance from the pivot differs
+            from the track's.
+        agreed: time [s] and place (3,) [m] of the latest position that agreed with the track.
+        outliers: times [s] and residuals (3,) [m] of the latest positions if they were outliers.
+        earlier_stretches: yaw uncertainty of stretches that were placed before a jump and will be
+            turned with the rest, each about its own pivot.
         earlier_unknown_yaws: yaw uncertainty of stretches that were placed before a gap and never
             turned, applied once the frame's yaw is known.
-        jumps: number of times that the track, not the positions, proved to be wrong.
+        jumps: where the track, not the positions, proved to be wrong, in order.
         yaw_variance: variance of the track's own yaw when it was placed [rad^2].
         since_jump: number of positions since the last jump.
         yaw_offset_unknown: whether the track's covariance does not know that its yaw is not the
@@ -133,10 +161,12 @@ class MapFrameState:
     since: float = -math.inf
     pivot_variance: float = math.inf
     alignment: PlanarAlignment = field(default_factory=PlanarAlignment)
-    distance_mismatches: int = 0
-    outlier_residuals: tuple[FloatArray, ...] = ()
+    mismatches: tuple[float, ...] = ()
+    agreed: tuple[float, FloatArray] = field(default_factory=lambda: (-math.inf, np.zeros(3)))
+    outliers: tuple[tuple[float, FloatArray], ...] = ()
+    earlier_stretches: tuple[FrameTransform, ...] = ()
     earlier_unknown_yaws: tuple[FrameTransform, ...] = ()
-    jumps: int = 0
+    jumps: tuple[Jump, ...] = ()
     yaw_variance: float = 0.0
     yaw_offset_unknown: bool = False
     since_jump: float = math.inf
@@ -149,7 +179,11 @@ class MapFrameState:
         # A track that fixes have never moved keeps its own frame, in which its first yaw is zero.
         if not (self.yaw_offset_unknown and (self.position_known or self.transforms)):
             return self.earlier_unknown_yaws
-        return (*self.earlier_unknown_yaws, unknown_yaw(self.pivot, self.since, math.inf))
+        return (*self.earlier_unknown_yaws, *self.stretches(math.inf))
+
+    def stretches(self, until: float) -> tuple[FrameTransform, ...]:
+        """Return the yaw uncertainty of the stretches with one unknown yaw, the last until then."""
+        return (*self.earlier_stretches, unknown_yaw(self.pivot, self.since, until))
 
     def holds(self, fix: Fix) -> bool:
         """Return whether a fix holds for the track in its final frame.

@@ -15,12 +15,19 @@ from typing import NamedTuple
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from filterpy.kalman import predict as filterpy_predict
+from scipy.linalg import eigh
 from scipy.linalg.lapack import dposv, dpotrf
+from scipy.optimize import brentq
 
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import CORE, GAIN, REPORTED, Block, symmetric
 from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
+
+TO_GATE = math.inf
+"""Power that inflates an outlier until it is none. NIS / gate does not suffice for a measurement
+that is more certain than the state: from far off it would move the rest of the state, too, by many
+of its sigmas."""
 
 
 class UpdateResult(NamedTuple):
@@ -109,7 +116,8 @@ def update(
         gate: NIS above which it counts as an outlier; None for no gate.
         gains_from: which covariance determines the gains: `GAIN` or `REPORTED`.
         power: an outlier's covariance is multiplied by this power of NIS / gate, so that a run of
-            outliers can still correct a wrong filter; None rejects outliers.
+            outliers can still correct a wrong filter; `TO_GATE` until its NIS is the gate's; None
+            rejects outliers.
 
     Returns:
         The state and the outcome. Values that are not finite and covariances that are not positive
@@ -129,7 +137,10 @@ def update(
     if gate is not None and gate_nis > gate:
         if power is None:
             return s, UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis, log_likelihood)
-        scale = (gate_nis / gate) ** power
+        if power == TO_GATE:
+            scale = _to_gate(residual, S[gains_from], R[gains_from], gate)
+        else:
+            scale = (gate_nis / gate) ** power
     after = corrected(s, residual, H, scale * R, gains_from)
     return after, UpdateResult("", nis, scale, residual, sigma, gate_nis, log_likelihood)
 
@@ -178,6 +189,18 @@ def _fault_of(value: FloatArray, covariance: FloatArray) -> str:
     if not math.isfinite(np.vdot(value, value) + np.vdot(covariance, covariance)):
         return "value that is not finite"
     return "covariance not positive definite" if dpotrf(covariance, lower=1)[1] else ""
+
+
+def _to_gate(residual: FloatArray, S: FloatArray, R: FloatArray, gate: float) -> float:
+    """Return the factor on R, a part of S, with which the NIS of an outlier is the gate's."""
+    variances, axes = eigh(S - R, R)
+    variances, squared = np.maximum(variances, 0.0), np.square(axes.T @ residual)
+
+    def excess(scale: float) -> float:
+        return float((squared / (variances + scale)).sum() - gate)
+
+    # Without S - R it would be the upper limit's half.
+    return float(brentq(excess, 0.5, 2.0 * squared.sum() / gate))
 
 
 def _nis(residual: FloatArray, S: FloatArray) -> tuple[float, float]:

@@ -4,12 +4,14 @@ README.md, "Fixes". A track that starts without a pose sets its first position a
 zero. The fixes that place and orient it are no small corrections and do not go through the filter's
 linearisation: the frame is transformed exactly (and the right-invariant error with it), then the
 covariance is inflated as if this shift or turn were unknown, then the fix is an ordinary update.
-After a gap in which the direction was lost, the same applies to the track from there on.
+After a gap in which the direction was lost, and after a ride before it was known, the same applies
+to the track from there on.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +20,12 @@ from numpy.linalg import norm
 from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf import Updated
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unknown_yaw
+from stario.fusion.filter.frame_transform import (
+    FrameTransform,
+    Jump,
+    MapFrameState,
+    turned_with,
+)
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.kalman import UpdateResult
@@ -65,6 +72,9 @@ _INFLATION_RATIO, _MAX_SIGMA = 1e3, 1e5
 """Sigma of an unknown shift: this many times the sigma that remains after the measurement, but no
 more than this [m], beyond which the covariance keeps no digits for the fix."""
 
+_VEHICLE_ACCEL = 3.0
+"""Largest acceleration of a vehicle in which one stands or sits [m/s^2]."""
+
 YAW_UNKNOWN = "yaw not known"
 """Why a position or velocity is refused before the track's direction in the map is known."""
 
@@ -99,9 +109,13 @@ def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateRes
         places, m = _needs_placing(fix, m)
     if not places and m.frame.yaw_known:
         return _updated(fix, m, f)
+    alignment = PlanarAlignment()
     if places:
+        jump = _jump_after(m.frame.mismatches, fix, m)
+        if jump.carried and m.frame.alignment.count > _OUTLIERS_IN_A_ROW:
+            m, alignment = _moved_on(jump, m)
         m, transform = _placed(fix, m)
-    elif fix.kind == "position" and m.frame.distance_mismatches > 0:
+    elif fix.kind == "position" and m.frame.mismatches:
         return m, UpdateResult(_TOO_FAR)
     else:
         m, transform = _oriented(fix, m)
@@ -109,15 +123,17 @@ def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateRes
         return m, UpdateResult("too coarse" if fix.kind == "yaw" else YAW_UNKNOWN)
     m, result = _updated(fix, m, f)
     if places:
-        m = _with_alignment_begun(fix, m)
+        m = _with_alignment_begun(fix, m, alignment)
     now = m.ekf.nav_state()
     if places:
         known = np.arange(3) < (3 if fix.has_height else 2)
         covariance = now.position_covariance * np.outer(known, known)
-        completed = changed(transform, position_covariance=covariance)
+        completed = [changed(transform, position_covariance=covariance)]
     else:
-        completed = changed(transform, yaw_sigma=math.sqrt(now.covariance[2, 2]))
-    return m.with_frame(transforms=(*m.frame.transforms, completed)), result
+        turn = changed(transform, yaw_sigma=math.sqrt(now.covariance[2, 2]))
+        completed = [*(turned_with(turn, each) for each in m.frame.earlier_stretches), turn]
+        m = m.with_frame(earlier_stretches=())
+    return m.with_frame(transforms=(*m.frame.transforms, *completed)), result
 
 
 def after_gap(m: Mapped) -> MapFrameState:
@@ -129,7 +145,7 @@ def after_gap(m: Mapped) -> MapFrameState:
     since = now.time if s.position_known else s.since  # an unplaced track stays in one piece
     earlier_unknown_yaws = s.earlier_unknown_yaws
     if not s.yaw_known:
-        earlier_unknown_yaws = (*earlier_unknown_yaws, unknown_yaw(s.pivot, s.since, now.time))
+        earlier_unknown_yaws = (*earlier_unknown_yaws, *s.stretches(now.time))
     return MapFrameState(
         position_known=False,
         yaw_known=False,
@@ -154,13 +170,42 @@ def _needs_placing(fix: Fix, m: Mapped) -> tuple[bool, Mapped]:
         return not frame.position_known, m
     if _SIGMA_RATIO**2 * float(np.trace(fix.covariance[:2, :2])) < frame.pivot_variance:
         return True, m
-    now, pivot = m.ekf.nav_state(), frame.pivot
-    fix_distance, track_distance = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
-    differs = abs(fix_distance - track_distance) > 3.0 * plane_sigma(
-        now, 6, fix
-    ) + _LENGTH_TOLERANCE * min(fix_distance, track_distance)
-    mismatches = frame.distance_mismatches + 1 if differs else 0
-    return mismatches >= _OUTLIERS_IN_A_ROW, m.with_frame(distance_mismatches=mismatches)
+    if not _distance_off(fix, m, frame.pivot):
+        return False, m.with_frame(mismatches=(), agreed=(fix.time, frame.pivot))
+    mismatches = (*frame.mismatches, fix.time)
+    return len(mismatches) >= _OUTLIERS_IN_A_ROW, m.with_frame(mismatches=mismatches)
+
+
+def _distance_off(fix: Fix, m: Mapped, place: FloatArray) -> float:
+    """Return by how much a position is nearer to a place on the track than the track, or further.
+
+    Returns:
+        The difference [m], whatever the track's direction; zero within what it may be by itself.
+    """
+    now = m.ekf.nav_state()
+    fix_distance, track_distance = norm((fix.value - place)[:2]), norm((now.p_W - place)[:2])
+    tolerance = _LENGTH_TOLERANCE * min(fix_distance, track_distance)
+    off = float(abs(fix_distance - track_distance))
+    return off if off > 3.0 * plane_sigma(now, 6, fix) + tolerance else 0.0
+
+
+def _jump_after(times: Sequence[float], fix: Fix, m: Mapped) -> Jump:
+    """Return the jump to a position, the last of those at times [s] that contradict the track."""
+    since, place = m.frame.agreed
+    until, metres = next(iter(times), fix.time), _distance_off(fix, m, place)
+    carried = 0.0 < metres <= 0.5 * _VEHICLE_ACCEL * (until - since) ** 2 < math.inf
+    return Jump(since, until, metres, carried)
+
+
+def _moved_on(jump: Jump, m: Mapped) -> tuple[Mapped, PlanarAlignment]:
+    """Leave the track where several positions had confirmed it, to be placed after a ride.
+
+    Its direction is the same on both sides: return what the positions so far tell about it, too.
+    """
+    s, until = m.frame, jump.until
+    stretches, jumps = s.stretches(until), (*s.jumps, jump)
+    moved = m.with_frame(since=until, earlier_stretches=stretches, jumps=jumps)
+    return moved, s.alignment.moved_on(_drift(m))
 
 
 def _placed(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform]:
@@ -186,13 +231,13 @@ def _placed(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform]:
     return Mapped(shifted, changed(m.frame, position_known=True)), transform
 
 
-def _with_alignment_begun(fix: Fix, m: Mapped) -> Mapped:
+def _with_alignment_begun(fix: Fix, m: Mapped, alignment: PlanarAlignment) -> Mapped:
     """Take the position just applied as the pivot about which later fixes turn the track."""
     begun = m.with_frame(
         pivot=fix.value,
         pivot_variance=float(np.trace(fix.covariance[:2, :2])),
-        alignment=PlanarAlignment(),
-        distance_mismatches=0,
+        alignment=alignment,
+        mismatches=(),
         yaw_variance=float(m.ekf.nav_state().covariance[2, 2]),
     )
     return _with_position_aligned(fix, begun)
@@ -226,12 +271,17 @@ def _oriented(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform | None]:
 
 def _with_position_aligned(fix: Fix, m: Mapped) -> Mapped:
     """Add a position to those that determine the direction together."""
-    now, pivot = m.ekf.nav_state(), m.frame.pivot
-    track, measured = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
+    pivot = m.frame.pivot
+    track, measured = (m.ekf.p_W - pivot)[:2], (fix.value - pivot)[:2]
     variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
-    drift = 0.5 * float(np.trace(without_yaw(now.covariance, POSITION)[:2, :2]))
-    aligned = m.frame.alignment.with_position(track, measured, variance, drift)
+    aligned = m.frame.alignment.with_position(track, measured, variance, _drift(m))
     return m.with_frame(alignment=aligned)
+
+
+def _drift(m: Mapped) -> float:
+    """Return the variance of the track's position per axis, without the yaw's part [m^2]."""
+    P = without_yaw(m.ekf.nav_state().covariance, POSITION)
+    return 0.5 * float(np.trace(P[:2, :2]))
 
 
 def _updated(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateResult]:
@@ -254,26 +304,30 @@ def _with_position(fix: Fix, before: Mapped, gate: float) -> tuple[Mapped, Updat
     """Update with a position; inflate an outlier, but move the track after similar ones."""
     since_jump = before.frame.since_jump + 1
     after, result = _measured(before.ekf, fix, gate)
-    residual = result.residual
-    aligned: tuple[FloatArray, ...] = ()
+    residual, agreed = result.residual, before.frame.agreed
+    aligned: tuple[tuple[float, FloatArray], ...] = ()
     if residual is not None and result.gated:
         aligned = tuple(
-            r
-            for r in before.frame.outlier_residuals
+            (time, r)
+            for time, r in before.frame.outliers
             if r @ residual > _SAME_DIRECTION * norm(r) * norm(residual)
         )
-        aligned = (*aligned, residual)
-    m = Mapped(after, changed(before.frame, since_jump=since_jump, outlier_residuals=aligned))
+        aligned = (*aligned, (fix.time, residual))
+    elif residual is not None:
+        agreed = fix.time, after.p_W
+    frame = changed(before.frame, since_jump=since_jump, outliers=aligned, agreed=agreed)
     if residual is None or len(aligned) < _OUTLIERS_IN_A_ROW:
-        return m, result
-    moved = before.ekf.with_position_inflated(float(norm(residual)))
-    after, result = _measured(moved, fix, gate)
-    jumps = m.frame.jumps + 1
-    m = Mapped(after, changed(m.frame, outlier_residuals=(), jumps=jumps, since_jump=0))
+        return Mapped(after, frame), result
+    metres = float(norm(residual))
+    jump = _jump_after([time for time, _ in aligned], fix, before)._replace(metres=metres)
+    after, result = _measured(before.ekf.with_position_inflated(metres), fix, gate)
+    agreed, jumps = (fix.time, after.p_W), (*frame.jumps, jump)
+    frame = changed(frame, outliers=(), agreed=agreed, jumps=jumps, since_jump=0)
+    m = Mapped(after, frame)
     if since_jump <= _POSITIONS_APART and m.frame.yaw_known:
         # Its direction has proved to be wrong: let later fixes turn the track from here on.
         m = m.with_frame(
             yaw_known=False, since=fix.time, yaw_offset_unknown=True, since_jump=math.inf
         )
-        m = _with_alignment_begun(fix, m)
+        m = _with_alignment_begun(fix, m, PlanarAlignment())
     return m, result

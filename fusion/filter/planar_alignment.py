@@ -48,16 +48,31 @@ class PlanarAlignment:
         discount = mean_variance / (mean_variance + max(0.0, drift - self.drift))
         return PlanarAlignment(discount * self.sums + row / variance, self.count + 1, drift)
 
+    def moved_on(self, drift: float) -> PlanarAlignment:
+        """Return the alignment for a track that an unknown shift follows, in the same direction.
+
+        What the positions so far tell relative to their mean remains.
+
+        Args:
+            drift: variance of the track's position now [m^2].
+        """
+        along, across, size = self._about_mean
+        return PlanarAlignment(np.array([0.0] * 5 + [along, across, size]), 0, drift)
+
+    @property
+    def _about_mean(self) -> tuple[float, float, float]:
+        """The last three sums about the means of t and f instead."""
+        weight, a, b, c, d, along, across, size = self.sums
+        weight = max(weight, np.finfo(float).tiny)
+        means = a * c + b * d, a * d - b * c, a * a + b * b
+        return along - means[0] / weight, across - means[1] / weight, size - means[2] / weight
+
     @property
     def turn(self) -> tuple[float, float]:
         """Turn from the track to the fixes and its sigma [rad]; infinite sigma: unknown."""
-        weight, a, b, c, d, along, across, size = self.sums
-        if weight == 0.0:
-            return 0.0, math.inf
-        along -= (a * c + b * d) / weight
-        across -= (a * d - b * c) / weight
+        along, across, size = self._about_mean
         # Noise inflates both the fixes' and the track's spread: use the smaller.
-        modulus = min(math.hypot(along, across), size - (a * a + b * b) / weight)
+        modulus = min(math.hypot(along, across), size)
         return math.atan2(across, along), 1.0 / math.sqrt(modulus) if modulus > 0.0 else math.inf
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, frame_rotation
+from stario.fusion.filter.frame_transform import FrameTransform, Jump, MapFrameState, frame_rotation
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
@@ -69,7 +69,7 @@ def smooth(
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, frame.transforms)
     builder = GraphBuilder(config, first)
-    records = _with_climbs(records)
+    records = _without_rides(_with_climbs(records), frame.jumps)
     rejected_later = {time for record in records for time in record.rejected_later}
     for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
@@ -126,6 +126,21 @@ def _with_climbs(records: Sequence[Record]) -> list[Record]:
             rate = _rate(time, height, at) if known else UNKNOWN_RATE
         found.append(record.at_rate(rate))
     return found
+
+
+def _without_rides(records: Sequence[Record], jumps: Sequence[Jump]) -> list[Record]:
+    """Return the records without what was relative to something that moved (`Jump`)."""
+
+    def carried(stop: float) -> bool:
+        """Return whether the second that ends then overlaps such a time."""
+        return any(j.carried and j.since < stop < j.until + WINDOW_SECONDS for j in jumps)
+
+    return [
+        record._replace(offered=None, zero_velocity=None)
+        if carried(record.interval.stop)
+        else record
+        for record in records
+    ]
 
 
 def _silent(time: FloatArray, stop: FloatArray) -> BoolArray:

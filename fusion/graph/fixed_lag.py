@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.filter.ekf import initialised, propagate
-from stario.fusion.filter.estimates import nav_states
+from stario.fusion.filter.estimates import nav_states, with_unknown_way
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import with_unknown_yaws
 from stario.fusion.filter.gained import Gained
@@ -57,7 +57,7 @@ class FixedLag:
         self._origin_W = first.p_W  # of the graph; see `EkfState`
         self.builder = GraphBuilder(self._config, local, count, streaming=True)
         self._ahead = initialised(local, 0)  # the newest state, propagated from the last keyframe
-        self._frame = first.map_frame, filtered.map_frame.jumps
+        self._frame = first.map_frame, len(filtered.map_frame.jumps)
         # Of the gyroscope bias's prior, narrowed since as in the filter [rad^2/s^2].
         self._bias_variance = filtered.bias_prior.variance
 
@@ -73,8 +73,10 @@ class FixedLag:
         """Return the newest state, given the filter's."""
         ahead = self._ahead.estimate(filtered.in_gap, self._frame[0])
         state = nav_states([ahead])[0].shifted(self._origin_W)
-        states = with_reported_covariances([state], [filtered.estimate()])
-        return with_unknown_yaws(states, filtered.map_frame.unknown_yaws)[0]
+        estimate = filtered.estimate()
+        (state,) = with_reported_covariances([state], [estimate])
+        state = with_unknown_way(state, estimate.way_variance)
+        return with_unknown_yaws([state], filtered.map_frame.unknown_yaws)[0]
 
     def step(self, filtered: EstimatorState, record: Record) -> None:
         """Follow the filter through an interval.
@@ -123,7 +125,7 @@ class FixedLag:
     def _is_stale(self, filtered: EstimatorState) -> bool:
         """Return whether the filter has since changed the state from which the graph began."""
         frame = filtered.map_frame
-        moved = (len(frame.transforms), frame.jumps) != self._frame
+        moved = (len(frame.transforms), len(frame.jumps)) != self._frame
         return moved or filtered.bias_prior.variance > _WIDER * self._bias_variance
 
     def _narrow_prior(self, variance: float) -> None:

@@ -7,7 +7,7 @@ the next thing to try. `stario.sequences.findings.verdict` joins them with those
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from stario.fusion.filter.innovations import USUAL_LEVEL
@@ -64,7 +64,7 @@ def health_findings(health: Health) -> list[Finding]:
         text = "Too early to judge the motion: it takes ten seconds of it."
         found += [*_flagged(health), _found(TOO_EARLY, text)]
     found += [*_floors(health), *_corrections(health), *_field(health)]
-    found += [*_fixes(health), *_direction(health)]
+    found += [*_fixes(health), *_jumps(health), *_rides(health), *_direction(health)]
     notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
     return found + [Finding(f"note_{k}", note) for k, note in enumerate(notes)]
 
@@ -295,6 +295,43 @@ def _fixes(health: Health) -> Iterator[Finding]:
         text += f", {gated} of them with less weight, since the track contradicts them"
     text += f"; {_counted(other)}." if other else "."
     yield Finding("fixes", text, advice, "warning" if wrong else "note", health.fixes)
+
+
+def _jumps(health: Health) -> Iterator[Finding]:
+    if not health.jumps:
+        return
+    since, until, metres, carried = max(health.jumps, key=lambda jump: jump[2])
+    count = len(health.jumps)
+    times = "" if count == 1 else f"{count} times, the most "
+    when = f"from {until:.0f} s on: the track was moved to them"
+    if carried:
+        when = (
+            f"between {since:.0f} s and {until:.0f} s, as if a vehicle had carried the device: the "
+            "track was moved to them, and the smoothed one leaves out the displacements in between"
+        )
+    text = f"Positions in a row contradict the track {times}by {metres:.0f} m {when}."
+    advice = "If nothing carried the device there, check these positions."
+    values = {"count": count, "since_s": since, "until_s": until, "metres": metres}
+    values |= {"carried": carried}
+    yield _found("jumps", text, advice, values)
+
+
+def _rides(health: Health) -> Iterator[Finding]:
+    if not health.rides:
+        return
+    spans = [f"between {since:.0f} s and {until:.0f} s" for since, until in health.rides]
+    text = (
+        f"{_listed(spans)} the device was accelerated as no walk does while the network saw it "
+        "stand: in a vehicle? Displacements do not tell that way; until a position does, the "
+        "track's sigma allows for 15 m/s."
+    )
+    advice = "Give position fixes after it: they place the track again."
+    yield _found("rides", text[0].upper() + text[1:], advice, {"rides": health.rides})
+
+
+def _listed(words: Sequence[str], most: int = 3) -> str:
+    rest = len(words) - most
+    return ", ".join(words[:most]) + (f" and {rest} times more" if rest > 0 else "")
 
 
 def _direction(health: Health) -> Iterator[Finding]:

@@ -30,6 +30,11 @@ class Health:
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
         corrections: time [s], distance [m], turn [rad] and cause of the latest updates, other than
             by fixes, that moved a filter's track by more than 1 m or 10 degrees at once.
+        jumps: where positions in a row contradicted the track and moved it: time of the last one
+            that agreed and of the first that did not [s], distance [m], and whether the device
+            was carried in between, as in a vehicle.
+        rides: start and stop of each stretch in which the network saw the device stand while it was
+            accelerated as no walk does, as in a vehicle [s], at most a hundred.
         fields_dropped: number of magnetometer samples dropped: their value or time is wrong, or
             repeats an earlier one.
         pressures: numbers of heights by the pressure applied (of these gated), of steps of the
@@ -71,6 +76,8 @@ class Health:
     zero_velocity: dict[str, int] = field(default_factory=dict)
     bearings: dict[str, int] = field(default_factory=dict)
     corrections: list[tuple[float, float, float, str]] = field(default_factory=list)
+    jumps: list[tuple[float, float, float, bool]] = field(default_factory=list)
+    rides: list[tuple[float, float]] = field(default_factory=list)
     fields_dropped: int = 0
     pressures: dict[str, int] = field(default_factory=dict)
     floors: list[FloorChange] = field(default_factory=list)

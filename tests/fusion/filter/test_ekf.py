@@ -177,6 +177,18 @@ def test_outliers_are_inflated_by_their_nis(driven):
     assert np.linalg.norm(driven.state.p_W - before) < 3.0
 
 
+def test_a_position_far_off_turns_a_track_no_further_than_one_at_the_gate():
+    """It is more certain than the track: by NIS / gate alone it would turn it by 18 sigmas."""
+    turn, gate = 0.1, 9.0
+    arm = np.zeros(15)
+    arm[[2, 7]] = 1.0, 20.0  # at 20 m along x, a turn moves the position along y
+    covariance = turn**2 * np.outer(arm, arm) + 1e-4 * np.eye(15)
+    ekf = Driven(0, nav_state(covariance, p_W=np.array([20.0, 0.0, 0.0])))
+    result = ekf.update_position_W(np.array([20.0, 40.0, 0.0]), 0.01 * np.eye(3), gate=gate)
+    assert result.nis == pytest.approx(400.0, rel=0.02)
+    assert 0.0 < yaw_twist(ekf.state.R_WB) < np.sqrt(gate) * turn
+
+
 def test_estimates_share_no_memory_with_the_filter(driven):
     # Views would keep every covariance: an hour at 20 updates a second then took twenty gigabytes.
     for estimate in (driven.state.estimate(), driven.state.clone_estimate(2)):

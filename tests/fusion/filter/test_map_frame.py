@@ -1,14 +1,16 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from simulated import measured
+from simulated import Oracle, measured
 from support import GRAPH as CONFIG
 from support import Altered, lying, stream
 
-from stario.fusion import Fix, Navigator, NavState, PriorPose, position_fix, yaw_fix
+from stario.fusion import Fix, Navigator, NavState, PriorPose, Track, position_fix, yaw_fix
 from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.planar_alignment import PlanarAlignment
+from stario.fusion.report.health import health_findings
 from stario.fusion.values.lie import yaw_twist
 from stario.sequences import ImuSequence, about_z, yaw_of
 from stario.sequences.accuracy.metrics import pose_errors
@@ -22,12 +24,12 @@ def true_at(walk: ImuSequence, time: float) -> np.ndarray:
     return walk.truth.at(np.array([time])).position_W[0]
 
 
-def fixes_of(walk: ImuSequence, times: Any, shift: np.ndarray) -> list[Fix]:
-    """Positions with a sigma of 0.3 m in a map frame that is turned and shifted."""
-    rng, turn, covariance = np.random.default_rng(1), about_z(2.0), 0.09 * np.eye(3)
+def fixes_of(walk: ImuSequence, times: Any, shift: np.ndarray, sigma: float = 0.3) -> list[Fix]:
+    """Positions with a sigma [m] in a map frame that is turned and shifted."""
+    rng, turn, covariance = np.random.default_rng(1), about_z(2.0), sigma**2 * np.eye(3)
     fixes = []
     for t in times:
-        place = turn.apply(true_at(walk, t)) + rng.normal(0.0, 0.3, 3) + shift
+        place = turn.apply(true_at(walk, t)) + rng.normal(0.0, sigma, 3) + shift
         fixes.append(position_fix(t, place, covariance))
     return fixes
 
@@ -157,6 +159,69 @@ def test_a_wrong_first_position_does_not_turn_the_track(backend):
     end = fixes[-1]
     at_end = min(states, key=lambda s: abs(s.time - end.time))
     assert np.linalg.norm(at_end.p_W - end.value) < 1.5
+
+
+def carried(walk: ImuSequence, start: float, stop: float, metres: float) -> ImuSequence:
+    """The walk in a vehicle that starts and stops then and goes that far along x."""
+
+    def ride(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s = np.clip((time - start) / (stop - start), 0.0, 1.0)
+        speed = 2.0 * metres / (stop - start)
+        distance = metres * (s - np.sin(2.0 * np.pi * s) / (2.0 * np.pi))
+        acceleration = speed * np.pi / (stop - start) * np.sin(2.0 * np.pi * s)
+        return np.outer(distance, [1.0, 0.0, 0.0]), np.outer(acceleration, [1.0, 0.0, 0.0])
+
+    attitude = walk.truth.at(np.clip(walk.time, *walk.truth.time[[0, -1]])).attitude_WB
+    accel = walk.accel + attitude.inv().apply(ride(walk.time)[1])
+    position_W = walk.truth.position_W + ride(walk.truth.time)[0]
+    return replace(walk, accel=accel, truth=replace(walk.truth, position_W=position_W))
+
+
+RIDE = (20.0, 50.0, 150.0)
+"""Start and stop [s] of a vehicle, and its way [m]."""
+
+
+def ridden(sigma: float = 0.3) -> tuple[ImuSequence, Oracle, list[Fix]]:
+    """A walk with the ride, displacements relative to the vehicle, and positions beside it."""
+    walk, _, _ = measured(3, 80.0, CONFIG)
+    ride = carried(walk, *RIDE)
+    oracle = Oracle(ride, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    times = np.concatenate([np.arange(2.0, 20.0, 3.0), np.arange(51.0, 79.0, 3.0)])
+    return ride, oracle, fixes_of(ride, times, np.zeros(3), sigma)
+
+
+def beside_ride(track: Track, ride: ImuSequence) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal errors [m] before the ride, and from the fixes after it on, and their sigmas."""
+    time = track.time
+    rows = (time < ride.truth.time[-1]) & ((time < 20.0) | (time > 51.0))
+    true = about_z(2.0).apply(ride.truth.at(time[rows]).position_W)
+    error = np.linalg.norm((track.trajectory.position_W[rows] - true)[:, :2], axis=1)
+    return error, np.sqrt(track.covariance[rows][:, [6, 7], [6, 7]].sum(axis=1))
+
+
+def test_a_ride_between_positions_bends_neither_side_of_the_smoothed_track():
+    ride, oracle, fixes = ridden()
+    track = Navigator(oracle, CONFIG).run(ride, fixes=fixes)
+    assert beside_ride(track, ride)[0].max() < 1.5
+    since, until, metres, is_carried = track.health.jumps[0]
+    assert is_carried
+    assert 15.0 < since < 20.0 < 50.0 < until < 52.0
+    assert metres == pytest.approx(150.0, abs=20.0)
+    (found,) = (f for f in health_findings(track.health) if f.code == "jumps")
+    assert found.level == "warning"
+    assert f"between {since:.0f} s and {until:.0f} s" in found.text
+
+
+def test_a_ride_before_the_direction_is_known_leaves_the_track_before_it_in_place():
+    """Positions on both sides give the direction together."""
+    ride, oracle, fixes = ridden(sigma=4.0)
+    track = Navigator(oracle, CONFIG).run(ride, fixes=fixes)
+    assert track.health.fixes["at a distance that contradicts the track"] == 2
+    assert [round(jump[1]) for jump in track.health.jumps] == [51]
+    for each in (track, track.filtered):
+        error, sigma = beside_ride(each, ride)
+        assert (error < 3.0 * sigma).all()
+        assert sigma.max() < 10.0
 
 
 @pytest.mark.slow
