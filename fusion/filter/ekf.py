@@ -15,7 +15,6 @@ from stario.fusion.filter.correlated_errors import DisplacementErrors, with_cons
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import (
     CLONED,
-    CORE,
     GAIN,
     REPORTED,
     Propagation,
@@ -31,10 +30,9 @@ from stario.fusion.filter.kalman import TO_GATE, Linear, UpdateResult, predict, 
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.values.checked import check_covariance, checked, checked_rotation
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.lie import yaw_twist
-from stario.fusion.values.state import NavState, changed
+from stario.fusion.values.state import changed
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import log_so3
 from stario.sequences.errors import InputError
@@ -42,25 +40,6 @@ from stario.sequences.sequence import FloatArray
 
 Updated = tuple[EkfState, UpdateResult]
 """State after a measurement, and the outcome."""
-
-
-def initialised(state: NavState, slots: int) -> EkfState:
-    """Return the filter's state from one with plain errors, with empty slots for clones.
-
-    Raises:
-        InputError: a shape is wrong, a value is not finite, `R_WB` is not a rotation, or the
-            covariance is not symmetric and positive semi-definite.
-    """
-    if slots < 0:
-        raise InputError("slots", repr(slots), "a number of clones >= 0")
-    v, p, b_g, b_a = (
-        checked(name, getattr(state, name), (3,)) for name in ("v_W", "p_W", "b_g", "b_a")
-    )
-    R = checked_rotation(state.R_WB)
-    covariance = checked("covariance", state.covariance, (CORE, CORE))
-    check_covariance(covariance)
-    now = checked("time", state.time, ()).item()
-    return EkfState.initial(NavState(now, R, v, p, b_g, b_a, covariance), slots)
 
 
 def propagate(s: EkfState, segment: Segment, accel_share: float = 1.0) -> EkfState:

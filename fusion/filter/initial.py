@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.ekf import initialised
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import POSITION, VELOCITY
 from stario.fusion.filter.kalman import Linear, update
@@ -95,7 +94,7 @@ def first_state(start: Start, prior: PriorPose | None, config: NavigatorConfig) 
     sigma += [f.gyro_bias_sigma] * 3 + [f.accel_bias_sigma] * 3
     covariance = np.diag(np.square(np.maximum(sigma, MIN_PRIOR_SIGMA)))
     state = NavState(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
-    return initialised(state, f.window_updates)
+    return EkfState.initial(state, f.window_updates)
 
 
 def _check_tilt(prior: PriorPose, start: Start) -> None:
@@ -142,4 +141,4 @@ def state_after_loss(s: EkfState, interval: ImuInterval, config: NavigatorConfig
     covariance[9:, 9:] += np.diag(drift)
     R_WB, v_W = yaw_rotation(s.R_WB) @ start.R_WB, np.zeros(3)
     state = NavState(interval.stop, R_WB, v_W, s.p_W, s.b_g, s.b_a, covariance)
-    return initialised(state, len(s.clone_times))
+    return EkfState.initial(state, len(s.clone_times))

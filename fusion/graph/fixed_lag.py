@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.filter.ekf import initialised, propagate
+from stario.fusion.filter.ekf import propagate
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimates import nav_states, with_unknown_way
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import with_unknown_yaws
@@ -56,7 +57,8 @@ class FixedLag:
         local = first.shifted(-first.p_W)
         self._origin_W = first.p_W  # of the graph; see `EkfState`
         self.builder = GraphBuilder(self._config, local, count, streaming=True)
-        self._ahead = initialised(local, 0)  # the newest state, propagated from the last keyframe
+        # The newest state, propagated from the last keyframe.
+        self._ahead = EkfState.initial(local, 0)
         self._frame = first.map_frame, len(filtered.map_frame.jumps)
         # Of the gyroscope bias's prior, narrowed since as in the filter [rad^2/s^2].
         self._bias_variance = filtered.bias_prior.variance
@@ -158,6 +160,6 @@ class FixedLag:
             self._fallbacks, self._reason = self._fallbacks + 1, str(error)
             self._begin(filtered, builder.count)
             return
-        self._ahead = initialised(newest, 0)
+        self._ahead = EkfState.initial(newest, 0)
         for segment in builder.segments[last]:
             self._ahead = propagate(self._ahead, segment)

@@ -31,7 +31,7 @@ class Driven:
         return result
 
     def initialise(self, state: NavState) -> None:
-        self.state = ekf.initialised(state, len(self.state.clone_times))
+        self.state = EkfState.initial(state, len(self.state.clone_times))
 
     def clone(self, instead_of: int | None = None) -> int:
         free = self.state.clone_times.index(None) if instead_of is None else instead_of
