@@ -322,8 +322,8 @@ def _rides(health: Health) -> Iterator[Finding]:
     spans = [f"between {since:.0f} s and {until:.0f} s" for since, until in health.rides]
     text = (
         f"{_listed(spans)} the device was accelerated as no walk does while the network saw it "
-        "stand: in a vehicle? Displacements do not tell that way; until a position does, the "
-        "track's sigma allows for 15 m/s."
+        "stand: in a vehicle? The track does not know that way; until a position tells it, its "
+        "sigma allows for 15 m/s."
     )
     advice = "Give position fixes after it: they place the track again."
     yield _found("rides", text[0].upper() + text[1:], advice, {"rides": health.rides})
