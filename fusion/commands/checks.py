@@ -248,7 +248,7 @@ def moments(
     graph: _Graph = False,
     seed: int = typer.Option(0, min=0, help="Seed of the moments."),
 ) -> None:
-    """Insert bad moments (shake, drop, table, standing, lift); report what the rest of tracks pays.
+    """Insert bad moments (shake, drop, throw, lift, bus, ...); report what the rest of tracks pays.
 
     Without PATH, use simulated walks in a building.
     """

@@ -309,10 +309,12 @@ def planar(position: NDArray[np.floating[Any]]) -> Complex:
     return np.asarray(position[:, 0] + 1j * position[:, 1])
 
 
-def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
-    """Fit a track (n,) to the truth (n,) by least squares in yaw and position."""
-    centre, target = track.mean(), truth.mean()
-    turn = np.vdot(track - centre, truth - target)
+def fit_yaw_and_position(
+    track: Complex, truth: Complex, part: BoolArray | slice = slice(None)
+) -> Complex:
+    """Fit a track (n,) to the truth (n,) by least squares in yaw and position, or by a part."""
+    centre, target = track[part].mean(), truth[part].mean()
+    turn = np.vdot(track[part] - centre, truth[part] - target)
     return np.asarray(target + np.exp(1j * np.angle(turn)) * (track - centre))
 
 

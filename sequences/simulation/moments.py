@@ -1,4 +1,4 @@
-"""Bad moments of a carried device: shaken, dropped, laid down, held by a standing person, lifted.
+"""Bad moments of a carried device: shaken, dropped, thrown, laid down, held still, lifted, driven.
 
 Each is a motion relative to the pose at one instant of a recording. It begins and ends at that
 pose, at rest except where noted, so that it can be inserted there (`insertion`). The frame L is
@@ -37,6 +37,13 @@ _DROP_HEIGHT, _BOUNCE = 1.0, 0.4
 
 _LIFT_HEIGHT, _LIFT_SPEED, _LIFT_ACCELERATION = 12.0, 1.6, 0.9
 """Way [m], speed [m/s] and acceleration [m/s^2] of a lift."""
+
+_THROW_HEIGHT, _THROW_TURNS = 1.2, 2.0
+"""Height to which a phone is thrown [m], and its turns until it is caught."""
+
+_BUS_SPEED, _BUS_ACCELERATION, _BUS_VIBRATION = 12.0, 1.2, 0.6
+"""Speed [m/s] and acceleration [m/s^2] of a bus, and of its vibration at 2 to 15 Hz (root mean
+square)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,12 +189,51 @@ def _climb(time: FloatArray) -> FloatArray:
     return np.cumsum(smoothed(speed, rate, 0.3)) / rate
 
 
+def _throw(rng: np.random.Generator, time: FloatArray, attitude_LB: Rotation) -> MomentMotion:
+    """Throw it up with some turns, catch it and hold it as before."""
+    thrown, speed = 3.0, math.sqrt(2.0 * STANDARD_GRAVITY * _THROW_HEIGHT)
+    caught = thrown + 2.0 * speed / STANDARD_GRAVITY
+    instants = [thrown - 0.6, thrown - 0.45, thrown - 0.3, thrown, caught, caught + 0.1]
+    speeds = [0.0, -0.5 * speed, 0.0, speed, -speed, 0.0]
+    # A hand stops what it catches within some ten milliseconds.
+    up = np.cumsum(smoothed(np.interp(time, instants, speeds), _rate(time), 0.01)) / _rate(time)
+    up -= up[-1] * ramp((time - caught - 0.2) / 1.5)
+    axis = about_z(rng.uniform(0.0, 2.0 * np.pi)).apply([1.0, 0.0, 0.0])
+    angle = 2.0 * np.pi * _THROW_TURNS * ramp((time - thrown + 0.1) / (caught - thrown + 0.2))
+    return _in_same_field(up[:, None] * [0.0, 0.0, 1.0], angle[:, None] * axis)
+
+
+def _bus(rng: np.random.Generator, time: FloatArray, attitude_LB: Rotation) -> MomentMotion:
+    """Stand in a bus of steel that starts, drives through a bend and back, and stops."""
+    motion, rate = _standing(rng, time, attitude_LB), _rate(time)
+    rising, stop = 5.0 + _BUS_SPEED / _BUS_ACCELERATION, float(time[-1]) - 5.0
+    speeds = [0.0, _BUS_SPEED, _BUS_SPEED, 0.0]
+    speed = smoothed(np.interp(time, [5.0, rising, stop - rising + 5.0, stop], speeds), rate, 0.4)
+    bend = ramp((time - rising) / 10.0) - ramp((time - rising - 15.0) / 10.0)
+    heading = rng.uniform(0.0, 2.0 * np.pi) + bend
+    way = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(time))])
+    vibration = band_noise(rng, len(time), rate, 2.0, 15.0, 3) / (2.0 * np.pi * 8.5) ** 2
+    moving = (speed / _BUS_SPEED)[:, None]
+    offset = np.cumsum(speed[:, None] * way, axis=0) / rate + _BUS_VIBRATION * moving * vibration
+    turns = Rotation.from_rotvec(bend[:, None] * [0.0, 0.0, 1.0])
+    turns *= Rotation.from_rotvec(motion.turn_L)
+    inside = _within(time, 3.0)
+    return MomentMotion(
+        motion.offset_L + offset,
+        turns.as_rotvec(),
+        inside * (0.6 + 0.5 * bend),
+        1.0 - 0.35 * inside,
+    )
+
+
 MOMENTS = (
     Moment("shake 10 s", 10.0, _shake),
     Moment("shake 25 s", 25.0, _shake),
     Moment("drop", 10.0, _drop),
+    Moment("throw", 8.0, _throw),
     Moment("table", 20.0, _laid_down),
     Moment("standing", 60.0, _standing),
     Moment("lift", 24.0, _lift),
+    Moment("bus", 60.0, _bus),
 )
 """All moments."""

@@ -59,6 +59,7 @@ _COLUMNS = (
     Column("joined: mean", "joined_ratio", over=gmean),
     Column("worst", "joined_ratio", over=np.max),
     Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", lambda ratio: (ratio < MAX_RATIO).mean()),
+    Column("end [sigma]", "end_sigmas", ".1f", np.max),
     Column("step [m]", "step", ".1f", np.max),
     Column("turn [deg]", "turn", ".1f", np.max),
     Column("both small", "small", ".0%", np.mean),
@@ -77,8 +78,9 @@ def moment_costs(
     It begins at the first known position, and is cut if it is long.
 
     Figures: error of the rest [m], its parts fitted separately (`error_without`, `error_with`,
-    their `ratio`) or as a whole (`joined_...`); largest correction of position [m] and attitude
-    [deg] between two outputs (`step`, `turn`, whether both are `small`, and without the moment).
+    their `ratio`) or as a whole (`joined_...`); the end's error in its sigmas, the part before
+    being fitted (`end_sigmas`); largest correction of position [m] and attitude [deg] between two
+    outputs (`step`, `turn`, whether both are `small`, and without the moment).
 
     Raises:
         InputError: it has no ground truth, or cannot be run.
@@ -112,6 +114,7 @@ def moment_table(scores: pd.DataFrame) -> str:
         "without: median error [m] of the parts before and after, each fitted in yaw and position;",
         "ratio of that error with the moment to that without: geometric mean, worst; joined: both "
         "parts fitted as one; share of recordings whose rest is below the limit",
+        "end: its largest error, the part before being fitted, in sigmas",
         f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
         f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
     ]
@@ -122,8 +125,10 @@ def _cost(
     sequence: ImuSequence, inserted: Inserted, without: Track, track: Track
 ) -> dict[str, float]:
     with_it, start = inserted.sequence, inserted.start
-    apart, as_one = _errors_of_rest(sequence, without, start, start)
-    apart_with, as_one_with = _errors_of_rest(with_it, track, start, inserted.stop)
+    apart, as_one, _ = _errors_of_rest(sequence, without, start, start)
+    apart_with, as_one_with, end = _errors_of_rest(with_it, track, start, inserted.stop)
+    assert track.covariance is not None  # both back ends give it
+    sigma = math.sqrt(float(np.trace(track.covariance[-1, 6:8, 6:8])))
     step, turn = largest_correction(with_it, track)
     step_without, turn_without = largest_correction(sequence, without)
     return {
@@ -133,6 +138,7 @@ def _cost(
         "joined_without": as_one,
         "joined_with": as_one_with,
         "joined_ratio": as_one_with / as_one,
+        "end_sigmas": end / sigma,
         "step": step,
         "turn": turn,
         "small": float(step <= MAX_STEP and turn <= MAX_TURN),
@@ -143,7 +149,7 @@ def _cost(
 
 def _errors_of_rest(
     sequence: ImuSequence, track: Track, start: float, stop: float
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """Return `_errors` before and after a moment."""
     if sequence.truth is not None:
         inside = track.trajectory.valid & sequence.truth.covers(track.time)
@@ -159,17 +165,23 @@ def _errors_of_rest(
     return _errors(truth[rest], estimate[rest], time[rest] < start)
 
 
-def _errors(truth: Complex, estimate: Complex, before: BoolArray) -> tuple[float, float]:
-    """Return the root mean square errors [m] of both parts fitted by themselves, and as one."""
+def _errors(truth: Complex, estimate: Complex, before: BoolArray) -> tuple[float, float, float]:
+    """Return the errors [m] of both parts fitted by themselves, as one, and of the end.
+
+    The first two are root mean squares; the end's is that after a fit of the part before.
+    """
     squares = [
         np.abs(fit_yaw_and_position(estimate[part], truth[part]) - truth[part]) ** 2
         for part in (before, ~before)
         if part.sum() >= _MIN_KNOWN
     ]
     if not squares:
-        return math.nan, math.nan
+        return math.nan, math.nan, math.nan
+    end = math.nan
+    if before.sum() >= _MIN_KNOWN:
+        end = abs(fit_yaw_and_position(estimate, truth, before)[-1] - truth[-1])
     joined = np.abs(fit_yaw_and_position(estimate, truth) - truth) ** 2
-    return math.sqrt(np.concatenate(squares).mean()), math.sqrt(joined.mean())
+    return math.sqrt(np.concatenate(squares).mean()), math.sqrt(joined.mean()), end
 
 
 def largest_correction(sequence: ImuSequence, track: Track) -> tuple[float, float]:

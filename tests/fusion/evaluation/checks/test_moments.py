@@ -33,7 +33,13 @@ BY_NAME = {moment.name: moment for moment in MOMENTS}
 def cost(walk: int, ratio: float, step: float, turn: float, place: str = "start") -> pd.DataFrame:
     small = float(step <= 1.0 and turn <= 10.0)
     figures = {"error_without": 2.0, "ratio": ratio, "joined_ratio": 2.0, "small": small}
-    figures |= {"step": step, "turn": turn, "step_without": 0.1, "turn_without": 1.0}
+    figures |= {
+        "end_sigmas": ratio,
+        "step": step,
+        "turn": turn,
+        "step_without": 0.1,
+        "turn_without": 1.0,
+    }
     return scored(f"walk {walk}", {"filtered": figures}, f"drop, {place}")
 
 
@@ -42,7 +48,8 @@ def test_the_table_counts_small_ratios_and_small_corrections():
     lines = moment_table(joined(found)).splitlines()
     assert lines[1].split()[:4] == ["drop,", "end", "filtered", "1"]
     start = lines[2].split()
-    assert start[3:] == ["2", "2.00", "2.00", "4.00", "2.00", "2.00", "50%", "0.5", "20.0", "50%"]
+    assert start[3:9] == ["2", "2.00", "2.00", "4.00", "2.00", "2.00"]
+    assert start[9:] == ["50%", "4.0", "0.5", "20.0", "50%"]
     assert lines[3].split()[0] == "all"
 
 
@@ -71,9 +78,10 @@ def test_errors_are_those_of_each_part_and_of_both_as_one():
     truth = np.arange(20.0) + 0j
     before = np.arange(20) < 10
     estimate = np.where(before, truth, 10.0 + 1j * (truth - 10.0))
-    apart, joined = moments._errors(truth, estimate, before)
+    apart, joined, end = moments._errors(truth, estimate, before)
     assert apart == pytest.approx(0.0, abs=1e-9)
     assert joined > 1.0
+    assert end == pytest.approx(9.0 * np.sqrt(2.0))
     assert np.isnan(moments._errors(truth[:2], estimate[:2], before[:2])[0])
 
 
@@ -100,6 +108,17 @@ def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, costs):
 def test_a_fall_beyond_the_sensors_range_makes_no_correction_of_a_metre(costs):
     walk = simulate_imu(generate_walk(2, 20.0), 200.0, ImuErrors(), 2)
     assert costs("drop", walk).step < 1.0
+
+
+def test_a_phone_thrown_and_caught_keeps_its_heading(walk, costs):
+    found = costs("throw", walk)
+    assert found.end_sigmas < 3.0
+    assert found.error_with < 3.0 * found.error_without
+
+
+def test_the_sigma_of_a_track_allows_for_a_ride(costs):
+    walk = simulate_imu(generate_walk(2, 40.0), 100.0, ImuErrors(), 2)
+    assert costs("bus", walk).end_sigmas < 3.0
 
 
 MEASURED = {
