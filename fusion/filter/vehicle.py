@@ -22,9 +22,9 @@ _SECONDS = 5.0
 _STANDING = 0.5
 """Mean displacement of a second [m] below which the device stands in something, or on it."""
 
-_RIDING_NIS = 20.0
+_RIDING_NIS = 16.0
 """Mean NIS of a ride, halfway between what a standing device has without (up to 13) and in buses,
-metros and cars (from 28 on; EXPERIMENTS.md, "Rides")."""
+metros and cars (from 19 on; EXPERIMENTS.md, "Rides")."""
 
 _SPEED_SIGMA = 7.5
 """Standard deviation per axis of a vehicle's velocity [m/s]: uniform up to 15 m/s."""
