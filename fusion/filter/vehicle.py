@@ -11,20 +11,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.state import changed
 from stario.sequences.windows import WINDOW_SECONDS
 
-_SECONDS = 5.0
-"""Time over which the evidence is averaged [s]: a vehicle takes longer to start or to brake."""
+_SECONDS, _SHARE = 5.0, 0.7
+"""Share of the displacements within this time [s] that must contradict the IMU: a vehicle takes
+longer to start or to brake; what a throw leaves behind is over after two seconds."""
 
 _STANDING = 0.5
 """Mean displacement of a second [m] below which the device stands in something, or on it."""
 
-_RIDING_NIS = 16.0
-"""Mean NIS of a ride, halfway between what a standing device has without (up to 13) and in buses,
-metros and cars (from 19 on; EXPERIMENTS.md, "Rides")."""
+_RIDING_NIS = 12.5
+"""NIS that this share exceeds in a ride, halfway between what a device that stands or is thrown has
+(up to 11) and in buses (from 14 on; EXPERIMENTS.md, "Rides")."""
 
 _SPEED_SIGMA = 7.5
 """Standard deviation per axis of a vehicle's velocity [m/s]: uniform up to 15 m/s."""
@@ -60,10 +63,11 @@ class RideEvidence:
         after = changed(self, windows=windows)
         if windows[0][0] > stop - _SECONDS + WINDOW_SECONDS:  # not all of the time yet
             return after
-        _, nis, metres = (sum(column) / len(windows) for column in zip(*windows, strict=True))
-        if metres > _STANDING:
+        _, nis, metres = np.array(windows).T
+        if metres.mean() > _STANDING:
             return changed(after, standing_since=math.inf, riding=False)
-        return after._standing(windows[0][0] - WINDOW_SECONDS, stop, nis > _RIDING_NIS)
+        accelerated = bool(np.quantile(nis, 1.0 - _SHARE) > _RIDING_NIS)
+        return after._standing(windows[0][0] - WINDOW_SECONDS, stop, accelerated)
 
     def way_variance(self, time: float, known: float) -> float:
         """Return the variance per axis of the way in rides between two times [m^2].

@@ -1,5 +1,3 @@
-"""Rides in a vehicle, which the network sees as standing."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -27,14 +25,14 @@ def test_a_ride_is_told_with_when_it_may_have_begun_and_ended(still_model, backe
         covariance *= 0.05**2
 
     rides = {}
-    for acceleration in (0.0, 1.2):
+    for acceleration in (0.0, 1.5):
         navigator = Navigator(Altered(still_model, surely), backend=backend)
         track = navigator.run(shaken(acceleration))
         health = track.health
         assert not health.zero_velocity
         rides[acceleration] = health.rides
     assert rides[0.0] == []
-    ((since, until),) = rides[1.2]
+    ((since, until),) = rides[1.5]
     assert since < 20.0
     assert until > 55.0
     after, before = track.covariance[-1, 6, 6], (track.filtered or track).covariance[150, 6, 6]
