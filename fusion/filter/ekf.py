@@ -35,7 +35,6 @@ from stario.fusion.values.lie import yaw_twist
 from stario.fusion.values.state import changed
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import log_so3
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 Updated = tuple[EkfState, UpdateResult]
@@ -80,15 +79,7 @@ def clone(s: EkfState, instead_of: int | None = None) -> EkfState:
     Args:
         s: the state.
         instead_of: slot of a clone to replace; None for the first free slot.
-
-    Raises:
-        InputError: every slot is taken (`release` one first), or `instead_of` holds no clone.
     """
-    if instead_of is not None:
-        s.time_of_clone(instead_of)
-    elif None not in s.clone_times:
-        found = f"all {len(s.clone_times)} slots taken"
-        raise InputError("clone", found, "a free slot", "release one")
     slot = s.clone_times.index(None) if instead_of is None else instead_of
     X = s.X.copy()
     X[1 + slot] = X[0]
@@ -101,12 +92,7 @@ def clone(s: EkfState, instead_of: int | None = None) -> EkfState:
 
 
 def release(s: EkfState, slot: int) -> EkfState:
-    """Drop the clone in a slot.
-
-    Raises:
-        InputError: the slot holds no clone.
-    """
-    s.time_of_clone(slot)
+    """Drop the clone in a slot."""
     times = (*s.clone_times[:slot], None, *s.clone_times[slot + 1 :])
     rows, P = s.clone_rows(slot), s.covariances.copy()
     P[:, rows] = 0.0
@@ -143,11 +129,7 @@ def update_displacement(
         errors: its errors as they are; None if they are white with that covariance.
         gains_from: as for `kalman.update`.
         power: likewise.
-
-    Raises:
-        InputError: the slot holds no clone.
     """
-    s.time_of_clone(slot)
     p_i, p_j = s.X[1 + slot, :, 4], s.X[0, :, 4]
     blocks = displacement_jacobian(p_i, p_j, slot)
     before, noise = s, None

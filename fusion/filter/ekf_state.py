@@ -24,7 +24,6 @@ from stario.fusion.filter.jacobians import (
 from stario.fusion.values.lie import exp_times
 from stario.fusion.values.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 CONSIDERED_SECONDS = np.array([1.2, 1.2, 1.2, math.inf, math.inf, 10.0])
@@ -190,24 +189,8 @@ class EkfState:
         """Return the rows of a clone in the error state."""
         return slice(CORE + CLONE * slot, CORE + CLONE * (slot + 1))
 
-    def time_of_clone(self, slot: int) -> float:
-        """Return the time at which a clone was taken [s].
-
-        Raises:
-            InputError: the slot holds no clone.
-        """
-        time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
-        if time is None:
-            raise InputError("slot", repr(slot), f"a slot that holds a clone: {self.clone_slots}")
-        return time
-
     def clone_pose(self, slot: int) -> tuple[FloatArray, FloatArray]:
-        """Return R_WB (3, 3) and p_W (3,) of a clone as currently estimated.
-
-        Raises:
-            InputError: the slot holds no clone.
-        """
-        self.time_of_clone(slot)
+        """Return R_WB (3, 3) and p_W (3,) of a clone as currently estimated."""
         X = self.X[1 + slot]
         return X[:, :3], np.asarray(X[:, 4] + self.origin_W)
 
@@ -220,12 +203,9 @@ class EkfState:
         )
 
     def clone_estimate(self, slot: int, map_frame: int = 0) -> Estimate:
-        """Return the current estimate of a clone.
-
-        Raises:
-            InputError: the slot holds no clone.
-        """
-        time, rows, zero = self.time_of_clone(slot), self.clone_rows(slot), np.zeros(3)
+        """Return the current estimate of a clone."""
+        time, rows, zero = self.clone_times[slot], self.clone_rows(slot), np.zeros(3)
+        assert time is not None  # the slot holds a clone
         covariances = np.zeros((2, CORE, CORE))
         covariances[:, CLONED[:, None], CLONED] = self.covariances[:, rows, rows]
         X = self.X[1 + slot].copy()
