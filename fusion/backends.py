@@ -83,8 +83,7 @@ def _smoothed_states(
         for before, after in zip(states, final, strict=True)
     ]
     solved = with_reported_covariances(solved, filtered.estimates, np.array(turns))
-    known = frame.agreed[0]
-    solved = [with_unknown_way(s, last.ride.way_variance(s.time, known)) for s in solved]
+    solved = [with_unknown_way(s, last.way_variance(s.time)) for s in solved]
     return with_unknown_yaws(solved, frame.unknown_yaws), []
 
 

@@ -120,8 +120,11 @@ class EstimatorState:
 
     def with_way(self, estimate: Estimate) -> Estimate:
         """Return an estimate that knows of the unknown way of rides since the last position."""
-        variance = self.ride.way_variance(estimate.time, self.map_frame.agreed[0])
-        return changed(estimate, way_variance=variance)
+        return changed(estimate, way_variance=self.way_variance(estimate.time))
+
+    def way_variance(self, time: float) -> float:
+        """Return the variance per axis [m^2] of the way in rides from the last position to then."""
+        return self.ride.way_variance(time, self.map_frame.agreed[0])
 
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""

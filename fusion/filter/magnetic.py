@@ -32,7 +32,7 @@ from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
-DISTURBANCE_METRES = 5.0
+_DISTURBANCE_METRES = 5.0
 """Distance over which the disturbance decorrelates [m]: the reach of a beam or a radiator."""
 
 _ARMS_REACH = 1.0
@@ -159,7 +159,7 @@ class MagneticReference:
 
     def travelled(self, s: EkfState) -> bool:
         """Return whether a state is at another place than the last bearing."""
-        return self.pose is not None and _distance(s.p_W, self.pose[1]) > _NEW_PLACE
+        return self.pose is not None and math.dist(s.p_W[:2], self.pose[1][:2]) > _NEW_PLACE
 
     def placed(self, s: EkfState) -> tuple[MagneticReference, float]:
         """Return the reference at a state's place, and its distance from the one before [m].
@@ -167,7 +167,7 @@ class MagneticReference:
         The distance is zero until it is out of the reach of an arm: while people shake a phone
         where they stand, its disturbance stays what it is.
         """
-        metres = math.inf if self.place_W is None else _distance(s.p_W, self.place_W)
+        metres = math.inf if self.place_W is None else math.dist(s.p_W[:2], self.place_W[:2])
         if metres <= _ARMS_REACH:
             return self, 0.0
         return changed(self, place_W=s.p_W), metres
@@ -201,10 +201,6 @@ class MagneticReference:
         places = self.places + 1
         spread = self.spread + (deviation - self.spread) / min(places, _AVERAGING_COUNT)
         return changed(means, spread=spread, places=places)
-
-
-def _distance(a: FloatArray, b: FloatArray) -> float:
-    return math.hypot(a[0] - b[0], a[1] - b[1])
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
@@ -274,7 +270,7 @@ def propagated_field(s: EkfState, metres: float, seconds: float, sigma: float) -
     """
     assert s.field is not None  # set by `with_field`
     row = s.field_row + 1
-    moved = math.exp(-metres / DISTURBANCE_METRES)
+    moved = math.exp(-metres / _DISTURBANCE_METRES)
     iron = math.exp(-seconds / HARD_IRON_SECONDS)
     kept = np.array([moved, iron, iron, iron])
     sigmas = np.array([sigma, *[HARD_IRON_SIGMA] * 3])
